@@ -1,0 +1,15 @@
+"""Algorithms by name, one file each."""
+
+from __future__ import annotations
+
+from sacformer_jax.agents import sac, sacformer
+from sacformer_jax.agents.core import Agent
+from sacformer_jax.config import Config
+from sacformer_jax.envs.core import EnvSpec
+
+_MAKERS = {"sacformer": sacformer.make, "sac": sac.make}
+
+
+def make(config: Config, spec: EnvSpec) -> Agent:
+    """Builds the agent ``config.agent`` names."""
+    return _MAKERS[config.agent](config, spec)

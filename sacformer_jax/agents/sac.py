@@ -1,0 +1,20 @@
+"""SAC: an MLP actor on the current state (K = 1). Haarnoja et al., arXiv 1812.05905."""
+
+from __future__ import annotations
+
+from sacformer_jax.agents.core import Agent
+from sacformer_jax.agents.sac_update import make_sac_agent, sac_parts
+from sacformer_jax.config import Config
+from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.networks import MLPActor
+
+
+def make(config: Config, spec: EnvSpec) -> Agent:
+    """Builds SAC for an environment."""
+    actor = MLPActor(
+        widths=(config.actor.actor_width,) * config.actor.actor_layers,
+        activation=config.actor.actor_activation,
+        action_size=spec.action_size,
+        head_init_scale=config.actor.head_init_scale,
+    )
+    return make_sac_agent(sac_parts(config, spec, actor))

@@ -1,0 +1,31 @@
+"""SACFormer: SAC whose actor is a Decision Transformer over the last K (return, state) pairs."""
+
+from __future__ import annotations
+
+from sacformer_jax.agents.core import Agent
+from sacformer_jax.agents.sac_update import make_sac_agent, sac_parts
+from sacformer_jax.config import Config
+from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.networks import TransformerActor
+from sacformer_jax.transformer import TransformerConfig
+
+
+def make(config: Config, spec: EnvSpec) -> Agent:
+    """Builds SACFormer for an environment."""
+    settings = config.actor
+    actor = TransformerActor(
+        config=TransformerConfig(
+            layers=settings.actor_layers,
+            width=settings.actor_width,
+            heads=settings.actor_heads,
+            mlp_ratio=settings.actor_mlp_ratio,
+            dropout=settings.actor_dropout,
+            activation=settings.actor_activation,
+        ),
+        action_size=spec.action_size,
+        context_length=config.context.context_length,
+        # The state after the last step of an episode has a time step too.
+        max_time_step=spec.max_episode_steps + 1,
+        head_init_scale=settings.head_init_scale,
+    )
+    return make_sac_agent(sac_parts(config, spec, actor))

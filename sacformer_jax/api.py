@@ -1,0 +1,55 @@
+"""The public functions that are more than one module's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from sacformer_jax.config import ConfigError
+from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.evaluate import make_evaluator
+from sacformer_jax.policy import load_policy
+
+
+def evaluate(
+    run: str | Path,
+    episodes: int = 10,
+    gymnasium: bool = False,
+    policy: str = "best",
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Evaluates a run's policy under its mean action.
+
+    Args:
+      run: the run's folder.
+      episodes: number of episodes, at least 1.
+      gymnasium: in a real ``gymnasium.make`` environment; otherwise jitted on our own.
+      policy: ``"best"`` or ``"latest"``.
+      seed: of the resets.
+
+    Returns:
+      ``env``, ``episodes``, ``return_mean``, ``return_std``, ``length_mean``, and in Gymnasium the
+      per-step mean of each reward term (``reward_forward``, …).
+
+    Raises:
+      CheckpointError: there is no such run or policy.
+      ConfigError: ``episodes`` is below 1, or the task is not one of Gymnasium's.
+    """
+    from sacformer_jax.gymnasium_eval import evaluate_policy
+    from sacformer_jax.runner import summarize
+
+    if episodes < 1:
+        raise ConfigError(f"episodes={episodes}: must be at least 1")
+    loaded = load_policy(run, policy)
+    if gymnasium:
+        return evaluate_policy(loaded, episodes, seed).record()
+    task = loaded.config.task
+    env = VectorEnv(
+        make_env(task.env, task.engine, task.brax_backend), episodes, task.max_episode_steps
+    )
+    evaluator = make_evaluator(env, loaded.agent, loaded.config.context.context_length)
+    record = summarize(evaluator(loaded.state, jax.random.key(seed)))
+    names = ("episodes", "return_mean", "return_std", "length_mean")
+    return {"env": task.env, **{name: record[name] for name in names}}

@@ -1,0 +1,164 @@
+"""The trajectory replay: fixed-shape rings on the device, sampled as windows.
+
+Each observation is stored once: the successor of a step is the next ring entry. A window is drawn
+by a uniformly random stored step (the anchor) and a uniformly random place for it among the K
+slots, so windows overhang both ends of an episode. A window with ``n`` steps in it can then be
+drawn through ``n`` anchors; its weight 1/n makes the expected weight of all stored steps equal.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.context import discounted_suffix_sums
+from sacformer_jax.types import BufferState, Transition, Window
+
+
+@dataclasses.dataclass(frozen=True)
+class TrajectoryBuffer:
+    """Static facts of the replay; its functions are pure.
+
+    Attributes:
+      num_envs: N columns.
+      length: T, ring length of each column in steps.
+      obs_size: O.
+      action_size: A.
+      context_length: K.
+      max_episode_steps: longest episode.
+      hindsight: whether windows carry hindsight return-to-go; then only steps of finished
+        episodes are drawn.
+
+    Raises:
+      ValueError: a column cannot hold the longest episode plus a window.
+    """
+
+    num_envs: int
+    length: int
+    obs_size: int
+    action_size: int
+    context_length: int
+    max_episode_steps: int
+    hindsight: bool = False
+
+    def __post_init__(self) -> None:
+        needed = self.max_episode_steps + self.context_length
+        if self.length < needed:
+            raise ValueError(
+                f"buffer_capacity={self.length * self.num_envs} over num_envs={self.num_envs} "
+                f"gives {self.length} steps each: must be at least max_episode_steps + "
+                f"context_length = {needed} each, so buffer_capacity >= {needed * self.num_envs}"
+            )
+
+    def init(self) -> BufferState:
+        """An empty replay."""
+        shape = (self.num_envs, self.length)
+        return BufferState(
+            steps=Transition(
+                obs=jnp.zeros((*shape, self.obs_size)),
+                action=jnp.zeros((*shape, self.action_size)),
+                reward=jnp.zeros(shape),
+                terminated=jnp.zeros(shape, bool),
+                truncated=jnp.zeros(shape, bool),
+                bad=jnp.zeros(shape, bool),
+                time_step=jnp.zeros(shape, jnp.int32),
+                return_so_far=jnp.zeros(shape),
+            ),
+            head=jnp.zeros((), jnp.int32),
+            size=jnp.zeros((), jnp.int32),
+            running=jnp.zeros(self.num_envs, jnp.int32),
+        )
+
+    def add(self, state: BufferState, step: Transition) -> BufferState:
+        """Writes one step of all N environments over the oldest one."""
+
+        def write(ring: jax.Array, new: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_slice_in_dim(ring, new[:, None], state.head, axis=1)
+
+        ended = step.terminated | step.truncated
+        return BufferState(
+            steps=jax.tree.map(write, state.steps, step),
+            head=(state.head + 1) % self.length,
+            size=jnp.minimum(state.size + 1, self.length),
+            running=jnp.where(ended, 0, jnp.minimum(state.running + 1, self.length)),
+        )
+
+    def eligible(self, state: BufferState) -> jax.Array:
+        """int32 ``[N]``: how many of each column's oldest steps may be drawn."""
+        if self.hindsight:
+            return state.size - jnp.minimum(state.running, state.size)
+        return jnp.full(self.num_envs, state.size)
+
+    def can_sample(self, state: BufferState) -> jax.Array:
+        """bool: whether there is any step to draw."""
+        return jnp.any(self.eligible(state) > 0)
+
+    def sample(
+        self, state: BufferState, key: jax.Array, batch_size: int, rtg_discount: jax.Array
+    ) -> Window:
+        """Draws B windows; ``can_sample`` must hold.
+
+        Args:
+          state: the replay.
+          key: typed PRNG key.
+          batch_size: B.
+          rtg_discount: scalar discount of hindsight return-to-go (unused without hindsight).
+        """
+        anchor_key, slot_key = jax.random.split(key)
+        ends = jnp.cumsum(self.eligible(state))
+        draw = jax.random.randint(anchor_key, (batch_size,), 0, ends[-1])
+        column = jnp.searchsorted(ends, draw, side="right")
+        anchor = draw - jnp.where(column > 0, ends[column - 1], 0)  # age rank, 0 is the oldest
+        slot = jax.random.randint(slot_key, (batch_size,), 0, self.context_length)
+        return self.window(state, column, anchor, slot, rtg_discount)
+
+    def window(
+        self,
+        state: BufferState,
+        column: jax.Array,
+        anchor: jax.Array,
+        slot: jax.Array,
+        rtg_discount: jax.Array,
+    ) -> Window:
+        """The windows with the ``anchor``-th oldest step of ``column`` at ``slot`` (``[B]``)."""
+        steps, k = state.steps, self.context_length
+        rows = column[:, None]
+
+        def places(num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """Ring positions of ``num`` slots, whether in the ring, distance to the anchor."""
+            distance = jnp.arange(num) - slot[:, None]  # [B, num]
+            age_rank = anchor[:, None] + distance
+            inside = (age_rank >= 0) & (age_rank < state.size)
+            return (state.head - state.size + age_rank) % self.length, inside, distance
+
+        position, inside, distance = places(k + 1)
+        time_step = steps.time_step[rows, position]
+        anchor_time = jnp.take_along_axis(time_step, slot[:, None], axis=1)
+        # d steps after the anchor and past a reset, the time step is below d: equality is proof.
+        same_episode = inside & (time_step == anchor_time + distance)
+        step_position = position[:, :k]
+        real_step = same_episode[:, :k]
+        mask = real_step & ~steps.bad[rows, step_position]
+        terminated = steps.terminated[rows, step_position]
+        if self.hindsight:
+            position_on, inside_on, distance_on = places(k + self.max_episode_steps)
+            ahead = steps.time_step[rows, position_on] == anchor_time + distance_on
+            rewards = jnp.where(inside_on & ahead, steps.reward[rows, position_on], 0.0)
+            return_to_go = discounted_suffix_sums(rewards, k + 1, rtg_discount)
+        else:
+            return_to_go = jnp.zeros(position.shape)
+        return Window(
+            obs=jnp.where(same_episode[..., None], steps.obs[rows, position], 0.0),
+            action=jnp.where(mask[..., None], steps.action[rows, step_position], 0.0),
+            reward=jnp.where(mask, steps.reward[rows, step_position], 0.0),
+            discount=1.0 - terminated.astype(jnp.float32),
+            return_so_far=jnp.where(same_episode, steps.return_so_far[rows, position], 0.0),
+            return_to_go=jnp.where(same_episode, return_to_go, 0.0),
+            time_step=jnp.where(same_episode, time_step, 0),
+            state_mask=same_episode,
+            mask=mask,
+            bootstrap_mask=mask & (terminated | same_episode[:, 1:]),
+            weight=1.0 / jnp.sum(real_step, axis=1),
+        )

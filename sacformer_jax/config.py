@@ -1,0 +1,300 @@
+"""The typed configuration: frozen sections, validation with reasons, JSON round trip.
+
+Every field name is unique over all sections, so a field can be given by its bare name, in Python
+(``Config.from_preset("cpu", env="Hopper")``) and on the command line (``--env Hopper``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types as python_types
+import typing
+from fractions import Fraction
+from typing import Any, Literal
+
+AgentName = Literal["sacformer", "sac"]
+PresetName = Literal["cpu", "paper"]
+Conditioning = Literal["hindsight", "commanded", "none"]
+EngineName = Literal["auto", "native"]
+BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
+Activation = Literal["relu", "gelu", "tanh", "silu"]
+
+
+class ConfigError(ValueError):
+    """A setting that cannot work; the message names field, value and what would be right."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskConfig:
+    """What is learnt."""
+
+    env: str = "HalfCheetah"
+    """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, or brax:NAME."""
+    engine: EngineName = "auto"
+    """Physics engine of the MuJoCo tasks."""
+    brax_backend: BraxBackend = "spring"
+    """Physics backend of brax:NAME tasks."""
+    num_envs: int = 1
+    """Environments stepped side by side."""
+    max_episode_steps: int = 1000
+    """Time limit of an episode, in environment steps (truncation, not termination)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """How long, and what is kept."""
+
+    total_env_steps: int = 1_000_000
+    """Environment steps of the whole run, prefill included, over all environments."""
+    prefill_env_steps: int = 10_000
+    """Environment steps under uniformly random actions before the first update."""
+    eval_every: int = 2_000
+    """Environment steps between evaluations."""
+    eval_episodes: int = 4
+    """Episodes of each evaluation, under the mean action."""
+    checkpoint_every: int = 20_000
+    """Environment steps between checkpoints."""
+    chunk_env_steps: int = 1_000
+    """Environment steps of one jitted call; evaluations and checkpoints fall between calls."""
+    run_dir: str = ""
+    """Folder of the run; empty: a new one under runs/."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayConfig:
+    """Trajectory replay and how often it is learnt from."""
+
+    buffer_capacity: int = 1_000_000
+    """Environment steps the replay holds, over all environments."""
+    batch_size: int = 128
+    """Windows in a batch; each has up to context_length steps."""
+    updates_per_env_step: float = 1.0
+    """Gradient updates per environment step (UTD), over all environments."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ContextConfig:
+    """What the actor sees."""
+
+    context_length: int = 6
+    """K: (return-to-go, state) pairs the actor sees, in acting and in training."""
+    return_conditioning: Conditioning = "hindsight"
+    """Return-to-go in training: obtained afterwards, commanded (Eq. 1 as in acting), or none."""
+    target_return: float = 5_000.0
+    """G_1 in acting and in commanded conditioning, in units of reward."""
+    return_scale: float = 1_000.0
+    """Every return-to-go is divided by this."""
+    rtg_discount: float = 0.99
+    """Discount of hindsight return-to-go; 1 for none."""
+    normalize_obs: bool = False
+    """Normalize observations by their running mean and variance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorConfig:
+    """The actor network."""
+
+    actor_layers: int = 3
+    """Transformer blocks (sacformer) or hidden layers (sac)."""
+    actor_width: int = 128
+    """Width of tokens (sacformer) or hidden layers (sac)."""
+    actor_heads: int = 1
+    """Attention heads (sacformer)."""
+    actor_mlp_ratio: int = 4
+    """Hidden width of a block's MLP over actor_width (sacformer)."""
+    actor_dropout: float = 0.1
+    """Dropout rate in updates (sacformer); off in acting and evaluation."""
+    actor_activation: Activation = "relu"
+    """Activation function."""
+    head_init_scale: float = 1.0
+    """Gain of the Xavier-uniform initialization of the mean and log-std heads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CriticConfig:
+    """The twin critics."""
+
+    critic_layers: int = 2
+    """Hidden layers."""
+    critic_width: int = 256
+    """Width of the hidden layers."""
+    critic_activation: Activation = "relu"
+    """Activation function."""
+    critic_layer_norm: bool = False
+    """LayerNorm before each activation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SacConfig:
+    """The soft actor-critic update."""
+
+    actor_learning_rate: float = 3e-4
+    """Adam step size of the actor."""
+    critic_learning_rate: float = 3e-4
+    """Adam step size of the critics."""
+    discount: float = 0.99
+    """Discount factor γ."""
+    tau: float = 0.005
+    """Soft-update coefficient of the target critics."""
+    alpha: float = 0.2
+    """Entropy temperature: fixed, or the first value where it is tuned."""
+    tune_alpha: bool = False
+    """Tune the temperature to the target entropy."""
+    alpha_learning_rate: float = 3e-4
+    """Adam step size of log alpha."""
+    target_entropy: float | None = None
+    """What tuning aims at, in nats; None: minus the number of action dimensions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that decides a run."""
+
+    agent: AgentName = "sacformer"
+    """Algorithm."""
+    preset: PresetName = "paper"
+    """Where the values not given come from; `sacformer describe` prints them all."""
+    seed: int = 0
+    """Seed of everything random."""
+    task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
+    run: RunConfig = dataclasses.field(default_factory=RunConfig)
+    replay: ReplayConfig = dataclasses.field(default_factory=ReplayConfig)
+    context: ContextConfig = dataclasses.field(default_factory=ContextConfig)
+    actor: ActorConfig = dataclasses.field(default_factory=ActorConfig)
+    critic: CriticConfig = dataclasses.field(default_factory=CriticConfig)
+    sac: SacConfig = dataclasses.field(default_factory=SacConfig)
+
+    @classmethod
+    def from_preset(cls, preset: str = "cpu", **fields: Any) -> Config:
+        """The preset's values for the agent and environment asked for, with ``fields`` on top.
+
+        Args:
+          preset: one of :data:`~sacformer_jax.presets.PRESETS`.
+          **fields: any field by its bare name, e.g. ``env="Hopper", num_envs=4``.
+
+        Raises:
+          ConfigError: an unknown name or a value that cannot work.
+        """
+        from sacformer_jax.presets import resolve
+
+        return resolve(preset, fields).config.validated()
+
+    def replace(self, **fields: Any) -> Config:
+        """A copy with fields given by their bare names.
+
+        Raises:
+          ConfigError: an unknown name or a value of the wrong type.
+        """
+        places = field_places()
+        changes: dict[str, dict[str, Any]] = {}
+        for name, value in fields.items():
+            if name not in places:
+                raise ConfigError(_unknown("field", name, places))
+            section, kind = places[name]
+            changes.setdefault(section, {})[name] = _coerced(name, value, kind)
+        config = dataclasses.replace(self, **changes.pop("", {}))
+        for section, values in changes.items():
+            changed = dataclasses.replace(getattr(config, section), **values)
+            config = dataclasses.replace(config, **{section: changed})
+        return config
+
+    def flat(self) -> dict[str, Any]:
+        """All fields by their bare names, in the order of the sections."""
+        return {
+            name: getattr(getattr(self, section) if section else self, name)
+            for name, (section, _) in field_places().items()
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested plain values, ready for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Config:
+        """Inverse of :meth:`to_dict`.
+
+        Raises:
+          ConfigError: unknown fields or values of the wrong type.
+        """
+        sections = {section for section, _ in field_places().values()} - {""}
+        fields: dict[str, Any] = {}
+        for name, value in values.items():
+            fields.update(value if name in sections and isinstance(value, dict) else {name: value})
+        return cls().replace(**fields)
+
+    @property
+    def steps_and_updates(self) -> tuple[int, int]:
+        """Vector steps and gradient updates of one training iteration (their ratio is UTD)."""
+        ratio = Fraction(self.replay.updates_per_env_step).limit_denominator(1000)
+        ratio *= self.task.num_envs
+        return ratio.denominator, ratio.numerator
+
+    @property
+    def iterations_per_chunk(self) -> int:
+        """Training iterations of one jitted call."""
+        steps, _ = self.steps_and_updates
+        return max(1, self.run.chunk_env_steps // (steps * self.task.num_envs))
+
+    @property
+    def env_steps_per_chunk(self) -> int:
+        """Environment steps of one jitted call."""
+        return self.iterations_per_chunk * self.steps_and_updates[0] * self.task.num_envs
+
+    @property
+    def prefill_vector_steps(self) -> int:
+        """Steps of all environments under random actions (rounded up)."""
+        return -(-self.run.prefill_env_steps // self.task.num_envs)
+
+    def validated(self) -> Config:
+        """Itself, if it can work.
+
+        Raises:
+          ConfigError: with the field, its value and what would be right.
+        """
+        from sacformer_jax.validation import check
+
+        check(self)
+        return self
+
+
+def field_places() -> dict[str, tuple[str, Any]]:
+    """Each field's section ("" at the top) and type, by bare name."""
+    places: dict[str, tuple[str, Any]] = {}
+    for name, kind in typing.get_type_hints(Config).items():
+        if dataclasses.is_dataclass(kind):
+            for inner, inner_kind in typing.get_type_hints(kind).items():
+                assert inner not in places, f"field {inner} is in two sections"
+                places[inner] = (name, inner_kind)
+        else:
+            places[name] = ("", kind)
+    return places
+
+
+def _unknown(what: str, name: str, known: Any) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+    return f"{what} {name!r} does not exist; {hint}"
+
+
+def _coerced(name: str, value: Any, kind: Any) -> Any:
+    """``value`` as the field's type, where nothing is lost by it."""
+    if typing.get_origin(kind) is Literal:
+        choices = typing.get_args(kind)
+        if value not in choices:
+            raise ConfigError(f"{name}={value!r}: must be one of {', '.join(map(str, choices))}")
+        return value
+    if isinstance(kind, python_types.UnionType):
+        if value is None:
+            return None
+        kind = next(k for k in typing.get_args(kind) if k is not type(None))
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{name}={value!r}: must be of type {kind.__name__}")
+    if kind is float and not math.isfinite(value):
+        raise ConfigError(f"{name}={value!r}: must be a finite number")
+    return value

@@ -1,0 +1,129 @@
+"""What a person sees while training: start-up facts, a progress bar, the closing table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from sacformer_jax.checkpoint import num_bytes
+from sacformer_jax.logging import Record
+from sacformer_jax.train import Program
+from sacformer_jax.types import TrainState
+
+
+def _count(params: object) -> str:
+    return f"{sum(leaf.size for leaf in jax.tree.leaves(params)):,}"
+
+
+class _Speed(ProgressColumn):
+    """Environment steps per second since the program started."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("– steps/s" if speed is None else f"{speed:.0f} steps/s")
+
+
+class Reporter:
+    """Prints to a terminal; where there is none, a line an evaluation instead of a bar.
+
+    Args:
+      quiet: print nothing.
+    """
+
+    def __init__(self, quiet: bool = False):
+        self.console = Console(quiet=quiet, highlight=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f} env steps"),
+            BarColumn(bar_width=30),
+            _Speed(),
+            TextColumn("eval return {task.fields[eval_return]}"),
+            TextColumn("ETA"),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=quiet or not self.console.is_terminal,
+            speed_estimate_period=60.0,
+        )
+        self._started = time.perf_counter()
+
+    def __enter__(self) -> Reporter:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """Prints a line above the bar."""
+        self.console.print(text, markup=False)
+
+    @contextmanager
+    def timed(self, what: str) -> Iterator[None]:
+        """Announces something slow, then says how long it took."""
+        self.say(f"{what} …")
+        start = time.perf_counter()
+        yield
+        self.say(f"{what}: {time.perf_counter() - start:.1f} s")
+
+    def facts(self, program: Program, state: TrainState, run_path: Path) -> None:
+        """Says what is about to run."""
+        config, spec = program.config, program.env.spec
+        learner = state.learner
+        self.say(f"run          {run_path}")
+        self.say(
+            f"task         {spec.name}: {spec.obs_size} observations, {spec.action_size} actions, "
+            f"{config.task.num_envs} environments"
+        )
+        self.say(f"engine       {spec.engine} ({spec.engine_reason})")
+        self.say(f"agent        {config.agent}, preset {config.preset}, seed {config.seed}")
+        self.say(
+            f"parameters   actor {_count(learner.actor_params)}, "
+            f"critics {_count(learner.critic_params)}"
+        )
+        self.say(f"buffer       {num_bytes(state.buffer) / 2**20:.1f} MiB")
+
+    def start_training(self, env_steps: int, total: int) -> None:
+        """Shows the progress bar."""
+        self._started = time.perf_counter()
+        self._task = self._bar.add_task("train", total=total, completed=env_steps, eval_return="–")
+
+    def chunk_done(self, env_steps: int) -> None:
+        """Moves the bar."""
+        self._bar.update(self._task, completed=env_steps)
+
+    def evaluated(self, record: Record) -> None:
+        """Shows an evaluation."""
+        mean, std = record["return_mean"], record["return_std"]
+        self._bar.update(self._task, eval_return=f"{mean:.0f}")
+        self.say(
+            f"{record['env_steps']:>9,} env steps  {time.perf_counter() - self._started:6.0f} s  "
+            f"eval return {mean:8.1f} ± {std:.1f}  length {record['length_mean']:.0f}"
+        )
+
+    def table(self, evaluations: list[Record]) -> None:
+        """Prints the evaluations as a table (at most the last 15)."""
+        table = Table(title="evaluations, mean action")
+        for column in ("env steps", "return", "std", "length", "episodes"):
+            table.add_column(column, justify="right")
+        for record in evaluations[-15:]:
+            table.add_row(
+                f"{record['env_steps']:,}",
+                f"{record['return_mean']:.1f}",
+                f"{record['return_std']:.1f}",
+                f"{record['length_mean']:.0f}",
+                str(record["episodes"]),
+            )
+        self.console.print(table)

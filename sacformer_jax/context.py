@@ -1,0 +1,97 @@
+"""Return-to-go arithmetic and the acting context of the last K (return, state) pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.types import Context
+
+
+def empty(num_envs: int, context_length: int, obs_size: int) -> Context:
+    """A context without any pair: ``[N, K]``."""
+    return Context(
+        obs=jnp.zeros((num_envs, context_length, obs_size)),
+        return_so_far=jnp.zeros((num_envs, context_length)),
+        time_step=jnp.zeros((num_envs, context_length), jnp.int32),
+        mask=jnp.zeros((num_envs, context_length), bool),
+    )
+
+
+def push(
+    context: Context, obs: jax.Array, return_so_far: jax.Array, time_step: jax.Array
+) -> Context:
+    """Appends a pair to every context and drops the oldest.
+
+    Args:
+      context: ``[N, K]`` pairs.
+      obs: ``[N, O]``.
+      return_so_far: ``[N]`` reward collected before ``obs``.
+      time_step: int32 ``[N]``.
+    """
+
+    def append(old: jax.Array, new: jax.Array) -> jax.Array:
+        return jnp.concatenate([old[:, 1:], new[:, None]], axis=1)  # [N, K, ...]
+
+    return Context(
+        obs=append(context.obs, obs),
+        return_so_far=append(context.return_so_far, return_so_far),
+        time_step=append(context.time_step, time_step),
+        mask=append(context.mask, jnp.ones(obs.shape[0], bool)),
+    )
+
+
+def start(obs: jax.Array, context_length: int) -> Context:
+    """The context at the first state of an episode: ``obs [N, O]``."""
+    num_envs, obs_size = obs.shape
+    return push(
+        empty(num_envs, context_length, obs_size),
+        obs,
+        jnp.zeros(num_envs),
+        jnp.zeros(num_envs, jnp.int32),
+    )
+
+
+def advance(context: Context, next_obs: jax.Array, reward: jax.Array, done: jax.Array) -> Context:
+    """The context after a step: cleared where the episode ended.
+
+    Args:
+      context: the context acted on.
+      next_obs: ``[N, O]`` the state to act on next, after the reset where ``done``.
+      reward: ``[N]``.
+      done: bool ``[N]``.
+    """
+    return_so_far = jnp.where(done, 0.0, context.return_so_far[:, -1] + reward)
+    time_step = jnp.where(done, 0, context.time_step[:, -1] + 1)
+    kept = dataclasses.replace(context, mask=context.mask & ~done[:, None])
+    return push(kept, next_obs, return_so_far, time_step)
+
+
+def commanded_return_to_go(
+    return_so_far: jax.Array, target_return: jax.Array, return_scale: jax.Array
+) -> jax.Array:
+    """Eq. 1 unrolled: ``G_t = G_1 - (R_1 + … + R_{t-1})``, scaled. Any shape."""
+    return (target_return - return_so_far) / return_scale
+
+
+def discounted_suffix_sums(rewards: jax.Array, num: int, discount: jax.Array) -> jax.Array:
+    """``G_i = Σ_{l ≥ i} discount^(l-i) rewards_l`` for the first ``num`` positions.
+
+    A backward sum, not a difference of prefix sums, which would lose all precision in float32.
+
+    Args:
+      rewards: ``[B, L]``, zero after the episode's end.
+      num: how many leading positions are wanted, at most L.
+      discount: scalar.
+
+    Returns:
+      ``[B, num]``.
+    """
+    powers = discount ** jnp.arange(rewards.shape[1] - num + 1)
+    last = jnp.sum(rewards[:, num - 1 :] * powers, axis=1)
+    sums = [last]
+    for i in reversed(range(num - 1)):
+        sums.append(rewards[:, i] + discount * sums[-1])
+    return jnp.stack(sums[::-1], axis=1)  # [B, num]

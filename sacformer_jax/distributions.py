@@ -1,0 +1,58 @@
+"""The tanh-squashed Gaussian over a box of actions."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class TanhGaussian:
+    """``action = center + half_range * tanh(u)``, ``u ~ N(mean, exp(log_std)^2)``.
+
+    Attributes:
+      low: lower action bounds.
+      high: upper action bounds.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @property
+    def _center(self) -> np.ndarray:
+        return ((np.asarray(self.high) + np.asarray(self.low)) / 2).astype(np.float32)
+
+    @property
+    def _half_range(self) -> np.ndarray:
+        return ((np.asarray(self.high) - np.asarray(self.low)) / 2).astype(np.float32)
+
+    def mode(self, mean: jax.Array) -> jax.Array:
+        """The action at the mean of the Gaussian, ``[..., A]``."""
+        return self._center + self._half_range * jnp.tanh(mean)
+
+    def sample_and_log_prob(
+        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """A reparameterized action and its log density.
+
+        The tanh correction is in its stable form (SAC, appendix C):
+        ``log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u))``.
+
+        Args:
+          key: typed PRNG key.
+          mean: ``[..., A]``.
+          log_std: ``[..., A]``.
+
+        Returns:
+          ``(action [..., A], log_prob [...])``.
+        """
+        noise = jax.random.normal(key, mean.shape)
+        u = mean + jnp.exp(log_std) * noise
+        gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
+        squash = 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)) + np.log(self._half_range)
+        log_prob = jnp.sum(gaussian - squash, axis=-1)
+        return self._center + self._half_range * jnp.tanh(u), log_prob

@@ -1,0 +1,254 @@
+"""The environment contract, and vectorization with time limit and auto-reset.
+
+An :class:`Env` is a bundle of pure functions of *one* environment. :class:`VectorEnv` runs many,
+adds the time limit and resets finished ones. A fresh reset lies prepared beside every running
+environment and is swapped in where an episode ends; the *next* step refills those that were used.
+So an engine that lives on the host still needs only one call per step, and resets are new every
+time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvSpec:
+    """Static facts of an environment.
+
+    Attributes:
+      name: the name it was made by, e.g. ``"HalfCheetah"`` or ``"brax:ant"``.
+      obs_size: O, length of an observation (float32).
+      action_size: A, length of an action (float32).
+      action_low: lower action bounds, ``A`` floats.
+      action_high: upper action bounds, ``A`` floats.
+      max_episode_steps: the time limit, in environment steps.
+      engine: which physics runs it.
+      engine_reason: why that engine.
+      gymnasium_id: the same task in Gymnasium, or None.
+    """
+
+    name: str
+    obs_size: int
+    action_size: int
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    max_episode_steps: int
+    engine: str
+    engine_reason: str
+    gymnasium_id: str | None = None
+
+
+@flax.struct.dataclass
+class EnvStep:
+    """What one step of one environment gives, before any reset.
+
+    Attributes:
+      obs: ``[O]`` float32, the observation after the step.
+      reward: float32.
+      terminated: bool, the task ended (value 0 afterwards). Time limits are not known here.
+      bad: bool, the physics broke down: the other values are meaningless.
+      reward_terms: named parts of the reward (may be empty).
+    """
+
+    obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    bad: jax.Array
+    reward_terms: dict[str, jax.Array]
+
+
+class Env(Protocol):
+    """Pure functions of one environment; vectorized with ``jax.vmap``."""
+
+    spec: EnvSpec
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        """A fresh episode: ``(env_state, obs [O])``."""
+        ...
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
+        """One step under ``action [A]``, never a reset: ``(env_state, step)``."""
+        ...
+
+    def step_and_refill(
+        self,
+        states: Any,
+        actions: jax.Array,
+        refill: jax.Array,
+        prepared: tuple[Any, jax.Array],
+        keys: jax.Array,
+    ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
+        """Steps N environments and renews the prepared resets where ``refill [N]`` is true."""
+        ...
+
+
+def where_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """``jnp.where`` over PyTrees whose leaves lead with the axes of ``condition``."""
+
+    def select(a: jax.Array, b: jax.Array) -> jax.Array:
+        mask = condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim))
+        return jnp.where(mask, a, b)
+
+    return jax.tree.map(select, if_true, if_false)
+
+
+class JaxEnv:
+    """Base of environments that are JAX all through: refills by ``lax.cond`` only when needed."""
+
+    spec: EnvSpec
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        raise NotImplementedError
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
+        raise NotImplementedError
+
+    def step_and_refill(
+        self,
+        states: Any,
+        actions: jax.Array,
+        refill: jax.Array,
+        prepared: tuple[Any, jax.Array],
+        keys: jax.Array,
+    ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
+        prepared = jax.lax.cond(
+            jnp.any(refill),
+            lambda: where_tree(refill, jax.vmap(self.reset)(keys), prepared),
+            lambda: prepared,
+        )
+        return jax.vmap(self.step)(states, actions), prepared
+
+
+@flax.struct.dataclass
+class VectorEnvState:
+    """State of N environments.
+
+    Attributes:
+      env: the environments' own states, leaves ``[N, ...]``.
+      obs: ``[N, O]`` the observations to act on next.
+      time_step: int32 ``[N]``, steps taken in the running episode.
+      prepared: ``(env_state, obs)``, a fresh reset for each environment.
+      refill: bool ``[N]``, whose prepared reset has been used up.
+      key: typed PRNG key.
+    """
+
+    env: Any
+    obs: jax.Array
+    time_step: jax.Array
+    prepared: tuple[Any, jax.Array]
+    refill: jax.Array
+    key: jax.Array
+
+
+@flax.struct.dataclass
+class VectorStep:
+    """One step of N environments.
+
+    Attributes:
+      obs: ``[N, O]``, the final observation where an episode ended, *before* the reset.
+      reward: ``[N]`` float32, 0 where ``bad``.
+      terminated: bool ``[N]``, the task ended.
+      truncated: bool ``[N]``, cut off by the time limit or by bad physics.
+      bad: bool ``[N]``, bad physics: this transition must not be learnt from; ``obs`` repeats the
+        last good observation.
+      next_obs: ``[N, O]``, the observation to act on next (after the reset where one happened).
+      reward_terms: named parts of the reward, each ``[N]``.
+    """
+
+    obs: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    bad: jax.Array
+    next_obs: jax.Array
+    reward_terms: dict[str, jax.Array]
+
+    @property
+    def done(self) -> jax.Array:
+        """The episode ended, whichever way: bool ``[N]``."""
+        return self.terminated | self.truncated
+
+
+class VectorEnv:
+    """N copies of an environment with time limit and auto-reset.
+
+    Args:
+      env: the environment.
+      num_envs: N.
+      max_episode_steps: the time limit; default: the environment's own.
+
+    Raises:
+      ValueError: ``num_envs`` or ``max_episode_steps`` is below 1.
+    """
+
+    def __init__(self, env: Env, num_envs: int, max_episode_steps: int | None = None):
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}: must be at least 1")
+        limit = env.spec.max_episode_steps if max_episode_steps is None else max_episode_steps
+        if limit < 1:
+            raise ValueError(f"max_episode_steps={limit}: must be at least 1")
+        self.env = env
+        self.num_envs = num_envs
+        self.max_episode_steps = limit
+        self.spec = dataclasses.replace(env.spec, max_episode_steps=limit)
+
+    def init(self, key: jax.Array) -> VectorEnvState:
+        """N fresh episodes, and as many prepared."""
+        key, start_key, prepared_key = jax.random.split(key, 3)
+        reset = jax.vmap(self.env.reset)
+        env_state, obs = reset(jax.random.split(start_key, self.num_envs))
+        return VectorEnvState(
+            env=env_state,
+            obs=obs,
+            time_step=jnp.zeros(self.num_envs, jnp.int32),
+            prepared=reset(jax.random.split(prepared_key, self.num_envs)),
+            refill=jnp.zeros(self.num_envs, bool),
+            key=key,
+        )
+
+    def step(self, state: VectorEnvState, action: jax.Array) -> tuple[VectorEnvState, VectorStep]:
+        """Steps all environments under ``action [N, A]`` and resets those that finished."""
+        key, reset_key = jax.random.split(state.key)
+        reset_keys = jax.random.split(reset_key, self.num_envs)
+        (env_state, step), prepared = self.env.step_and_refill(
+            state.env, action, state.refill, state.prepared, reset_keys
+        )
+        bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
+        time_step = state.time_step + 1
+        terminated = step.terminated & ~bad
+        truncated = bad | (~terminated & (time_step >= self.max_episode_steps))
+        done = terminated | truncated
+        obs = jnp.where(bad[:, None], state.obs, step.obs)
+        next_env, next_obs = where_tree(done, prepared, (env_state, obs))
+        next_state = VectorEnvState(
+            env=next_env,
+            obs=next_obs,
+            time_step=jnp.where(done, 0, time_step),
+            prepared=prepared,
+            refill=done,
+            key=key,
+        )
+        return next_state, VectorStep(
+            obs=obs,
+            reward=jnp.where(bad, 0.0, step.reward),
+            terminated=terminated,
+            truncated=truncated,
+            bad=bad,
+            next_obs=next_obs,
+            reward_terms={
+                name: jnp.where(bad, 0.0, term) for name, term in step.reward_terms.items()
+            },
+        )
+
+    def random_action(self, key: jax.Array) -> jax.Array:
+        """Uniform actions within the bounds, ``[N, A]``."""
+        low, high = np.asarray(self.spec.action_low), np.asarray(self.spec.action_high)
+        shape = (self.num_envs, self.spec.action_size)
+        return jax.random.uniform(key, shape, jnp.float32, low, high)

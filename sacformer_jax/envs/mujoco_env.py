@@ -1,0 +1,91 @@
+"""A task on a physics engine: the five Gymnasium tasks as environments of the contract."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
+from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, make_engine, resolve_engine
+from sacformer_jax.envs.tasks import TASKS
+
+
+class MujocoEnv:
+    """One of :data:`~sacformer_jax.envs.tasks.TASKS` on a physics engine.
+
+    Args:
+      name: the task's name, e.g. ``"HalfCheetah"``.
+      engine: one of :data:`~sacformer_jax.envs.physics.ENGINES`.
+
+    Raises:
+      KeyError: no such task.
+      ValueError: no such engine.
+    """
+
+    def __init__(self, name: str, engine: str = "auto"):
+        self.task = task = TASKS[name]
+        engine_name, reason = resolve_engine(engine)
+        self.engine = make_engine(task, engine_name)
+        obs_size = jax.eval_shape(self.reset, jax.random.key(0))[1].shape[0]
+        self.spec = EnvSpec(
+            name=name,
+            obs_size=obs_size,
+            action_size=self.engine.action_low.shape[0],
+            action_low=tuple(self.engine.action_low.tolist()),
+            action_high=tuple(self.engine.action_high.tolist()),
+            max_episode_steps=task.max_episode_steps,
+            engine=engine_name,
+            engine_reason=reason,
+            gymnasium_id=task.gymnasium_id,
+        )
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        physics = self.engine.reset(self.reset_noise(key))
+        return physics.state, self.task.observe(physics.quantities)
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
+        physics = self.engine.step(state, action)
+        return physics.state, self._env_step(physics, action)
+
+    def step_and_refill(
+        self,
+        states: Any,
+        actions: jax.Array,
+        refill: jax.Array,
+        prepared: tuple[Any, jax.Array],
+        keys: jax.Array,
+    ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
+        stepped, fresh = jax.vmap(self.engine.step_and_reset)(
+            states, actions, refill, jax.vmap(self.reset_noise)(keys)
+        )
+        fresh_obs = jax.vmap(self.task.observe)(fresh.quantities)
+        steps = jax.vmap(self._env_step)(stepped, actions)
+        return (stepped.state, steps), where_tree(refill, (fresh.state, fresh_obs), prepared)
+
+    def reset_noise(self, key: jax.Array) -> ResetNoise:
+        """The random part of a reset, drawn as the Gymnasium task draws it."""
+        task, (qpos_key, qvel_key) = self.task, jax.random.split(key)
+        qpos = jax.random.uniform(
+            qpos_key, (self.engine.nq,), minval=-task.qpos_noise, maxval=task.qpos_noise
+        )
+        if task.qvel_noise_normal:
+            qvel = task.qvel_noise * jax.random.normal(qvel_key, (self.engine.nv,))
+        else:
+            qvel = jax.random.uniform(
+                qvel_key, (self.engine.nv,), minval=-task.qvel_noise, maxval=task.qvel_noise
+            )
+        return ResetNoise(qpos=qpos, qvel=qvel)
+
+    def _env_step(self, physics: PhysicsOutput, action: jax.Array) -> EnvStep:
+        quantities = physics.quantities
+        x_velocity = quantities.displacement[0] / self.engine.dt
+        terms = self.task.reward_terms(quantities, action, x_velocity)
+        return EnvStep(
+            obs=self.task.observe(quantities),
+            reward=jnp.stack(list(terms.values())).sum(),
+            terminated=self.task.terminated(quantities),
+            bad=physics.bad,
+            reward_terms=terms,
+        )

@@ -1,0 +1,111 @@
+"""Evaluation in a real ``gymnasium.make`` environment: the same loop a user would write."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sacformer_jax.config import ConfigError
+from sacformer_jax.policy import Policy
+
+
+@dataclasses.dataclass(frozen=True)
+class GymnasiumEvaluation:
+    """Outcome of E episodes in Gymnasium.
+
+    Attributes:
+      env: the Gymnasium id.
+      returns: ``[E]`` undiscounted sums of reward.
+      lengths: ``[E]`` steps.
+      reward_terms: mean per step of each reward term that Gymnasium's ``info`` reports.
+    """
+
+    env: str
+    returns: np.ndarray
+    lengths: np.ndarray
+    reward_terms: dict[str, float]
+
+    def record(self) -> dict[str, Any]:
+        """The outcome as plain values, reward terms included."""
+        return {
+            "env": self.env,
+            "episodes": int(self.returns.size),
+            "return_mean": float(self.returns.mean()),
+            "return_std": float(self.returns.std()),
+            "length_mean": float(self.lengths.mean()),
+            **self.reward_terms,
+        }
+
+
+def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
+    """Runs a policy's mean actions in the Gymnasium task it was trained on.
+
+    Args:
+      policy: the policy.
+      episodes: E, at least 1.
+      seed: of the first reset; the later ones follow from it.
+
+    Raises:
+      ConfigError: the environment has no Gymnasium twin, or ``episodes`` is below 1.
+    """
+    return _run(gymnasium_id(policy), episodes, seed, policy.reset, policy.predict)
+
+
+def evaluate_random(env_id: str, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
+    """The same with uniformly random actions."""
+    env = gymnasium.make(env_id)
+    env.action_space.seed(seed)
+    space = env.action_space
+    return _run(env_id, episodes, seed, lambda: None, lambda obs, reward: space.sample())
+
+
+def gymnasium_id(policy: Policy) -> str:
+    """The Gymnasium id of the policy's task.
+
+    Raises:
+      ConfigError: it has none.
+    """
+    if policy.spec.gymnasium_id is None:
+        raise ConfigError(
+            f"env={policy.spec.name!r}: not a task of Gymnasium; evaluate without --gymnasium"
+        )
+    return policy.spec.gymnasium_id
+
+
+def _run(
+    env_id: str,
+    episodes: int,
+    seed: int,
+    reset: Callable[[], None],
+    predict: Callable[[Any, float], np.ndarray],
+) -> GymnasiumEvaluation:
+    if episodes < 1:
+        raise ConfigError(f"episodes={episodes}: must be at least 1")
+    env = gymnasium.make(env_id)
+    returns, lengths = np.zeros(episodes), np.zeros(episodes, int)
+    terms: dict[str, float] = {}
+    for episode in range(episodes):
+        obs, _ = env.reset(seed=seed if episode == 0 else None)
+        reset()
+        reward, done = 0.0, False
+        while not done:
+            obs, step_reward, terminated, truncated, info = env.step(predict(obs, reward))
+            reward = float(step_reward)
+            returns[episode] += reward
+            lengths[episode] += 1
+            for name, value in info.items():
+                if name.startswith("reward_"):
+                    terms[name] = terms.get(name, 0.0) + float(value)
+            done = terminated or truncated
+    env.close()
+    steps = int(lengths.sum())
+    return GymnasiumEvaluation(
+        env=env_id,
+        returns=returns,
+        lengths=lengths,
+        reward_terms={name: total / steps for name, total in terms.items()},
+    )

@@ -1,0 +1,106 @@
+"""Where metrics go: JSONL files and TensorBoard.
+
+``metrics.jsonl`` holds one JSON object a line, without anything that depends on the clock, so that
+two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``updates``.
+
+``kind = "train"``, one line a chunk; means over its updates, or over the episodes finished in it
+(``null`` where none finished):
+  ``episodes``, ``episode_return_mean``, ``episode_return_max``, ``episode_length_mean``,
+  ``bad_physics`` (steps dropped), ``critic_loss``, ``actor_loss``, ``q_mean``, ``entropy`` (nats),
+  ``alpha``, ``actor_grad_norm``, ``critic_grad_norm``.
+``kind = "eval"``, one line an evaluation:
+  ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``.
+
+``timings.jsonl`` has a line a chunk: ``env_steps``, ``updates``, ``chunk_seconds``,
+``steps_per_second``, ``ms_per_update``, ``wall_seconds`` (training time since the program started
+or resumed, evaluations included).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from tensorboardX import SummaryWriter
+
+Record = dict[str, Any]
+
+
+def plain(value: Any) -> Any:
+    """A JSON value: NaN and infinity become None, arrays become numbers."""
+    if isinstance(value, str) or value is None:
+        return value
+    number = value.item() if hasattr(value, "item") else value
+    if isinstance(number, float) and not math.isfinite(number):
+        return None
+    return number
+
+
+class MetricLog:
+    """Appends records to a run's ``metrics.jsonl``, ``timings.jsonl`` and TensorBoard.
+
+    Args:
+      metrics_path: the JSONL file of metrics.
+      timings_path: the JSONL file of timings.
+      tensorboard_dir: folder of TensorBoard events.
+      keep_bytes: length to cut ``metrics.jsonl`` back to, when a run is resumed.
+      purge_after: environment steps after which TensorBoard events are dropped, on resume.
+    """
+
+    def __init__(
+        self,
+        metrics_path: Path,
+        timings_path: Path,
+        tensorboard_dir: Path,
+        keep_bytes: int = 0,
+        purge_after: int | None = None,
+    ):
+        mode = "r+b" if metrics_path.exists() else "wb"
+        self._metrics = metrics_path.open(mode)
+        self._metrics.truncate(keep_bytes)
+        self._metrics.seek(0, 2)
+        self._timings = timings_path.open("ab")
+        purge_step = None if purge_after is None else purge_after + 1
+        self._writer = SummaryWriter(str(tensorboard_dir), purge_step=purge_step)
+
+    @property
+    def metrics_bytes(self) -> int:
+        """Length of ``metrics.jsonl``, everything written so far included."""
+        self._metrics.flush()
+        return self._metrics.tell()
+
+    def write(self, kind: str, env_steps: int, updates: int, values: Record) -> Record:
+        """Appends a record of metrics and returns it as written."""
+        record = {"kind": kind, "env_steps": env_steps, "updates": updates}
+        record.update({name: plain(value) for name, value in values.items()})
+        self._metrics.write(json.dumps(record).encode() + b"\n")
+        self._metrics.flush()
+        self._scalars(kind, record, env_steps)
+        return record
+
+    def write_timing(self, env_steps: int, updates: int, values: Record) -> None:
+        """Appends a record of timings."""
+        record = {"env_steps": env_steps, "updates": updates, **values}
+        self._timings.write(json.dumps(record).encode() + b"\n")
+        self._timings.flush()
+        self._scalars("timing", values, env_steps)
+
+    def _scalars(self, kind: str, values: Record, env_steps: int) -> None:
+        for name, value in values.items():
+            if isinstance(value, int | float) and name != "env_steps":
+                self._writer.add_scalar(f"{kind}/{name}", value, env_steps)
+
+    def close(self) -> None:
+        """Flushes and closes all files."""
+        self._metrics.close()
+        self._timings.close()
+        self._writer.close()
+
+
+def read_records(path: Path, kind: str | None = None) -> list[Record]:
+    """The records of a JSONL file, all or of one kind."""
+    with path.open() as lines:
+        records = [json.loads(line) for line in lines]
+    return [record for record in records if kind in (None, record.get("kind"))]

@@ -1,0 +1,181 @@
+"""Actors and critics. Letters: B windows, T states of a window, O, A, D width."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.transformer import (
+    ACTIVATIONS,
+    LAYER_NORM_EPSILON,
+    Transformer,
+    TransformerConfig,
+    banded_causal_mask,
+)
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussianParams:
+    """Mean and log standard deviation of the Gaussian before tanh, each ``[..., A]``."""
+
+    mean: jax.Array
+    log_std: jax.Array
+
+
+jax.tree_util.register_dataclass(GaussianParams, ["mean", "log_std"], [])
+
+
+class GaussianHeads(nn.Module):
+    """Two linear heads; log-std clipped to [-20, 2].
+
+    Attributes:
+      action_size: A.
+      scale: gain of the Xavier-uniform kernels; small values start near mean 0 and std 1.
+    """
+
+    action_size: int
+    scale: float
+
+    @nn.compact
+    def __call__(self, features: jax.Array) -> GaussianParams:
+        init = nn.initializers.variance_scaling(self.scale**2, "fan_avg", "uniform")
+        mean = nn.Dense(self.action_size, kernel_init=init, name="mean")(features)
+        log_std = nn.Dense(self.action_size, kernel_init=init, name="log_std")(features)
+        return GaussianParams(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+
+
+class TransformerActor(nn.Module):
+    """The Decision-Transformer actor over ``(G_1, S_1, …, G_T, S_T)`` (paper, section 3.1).
+
+    Attributes:
+      config: the trunk.
+      action_size: A.
+      context_length: K; no position sees more than K pairs.
+      max_time_step: size of the time-step embedding.
+      head_init_scale: see :class:`GaussianHeads`.
+    """
+
+    config: TransformerConfig
+    action_size: int
+    context_length: int
+    max_time_step: int
+    head_init_scale: float
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: jax.Array,
+        return_to_go: jax.Array,
+        time_step: jax.Array,
+        state_mask: jax.Array,
+        deterministic: bool = True,
+    ) -> GaussianParams:
+        """Action distributions at every state.
+
+        Args:
+          obs: ``[B, T, O]``, normalized.
+          return_to_go: ``[B, T]``, scaled.
+          time_step: int32 ``[B, T]``.
+          state_mask: bool ``[B, T]``, real pairs.
+          deterministic: dropout off; otherwise the rng ``dropout`` is used.
+
+        Returns:
+          mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing.
+        """
+        width = self.config.width
+        batch, states = time_step.shape
+        xavier = nn.initializers.xavier_uniform()
+        time = nn.Embed(
+            self.max_time_step,
+            width,
+            embedding_init=nn.initializers.normal(0.02),
+            name="embed_time",
+        )(jnp.clip(time_step, 0, self.max_time_step - 1))
+        embed_return = nn.Dense(width, kernel_init=xavier, name="embed_return")
+        embed_state = nn.Dense(width, kernel_init=xavier, name="embed_state")
+        pairs = [embed_return(return_to_go[..., None]) + time, embed_state(obs) + time]
+        tokens = jnp.stack(pairs, axis=2).reshape(batch, 2 * states, width)  # [B, 2T, D]
+        tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
+
+        # Both tokens of a pair share its place in the band; a G token must not see its own S.
+        pair_mask = banded_causal_mask(state_mask, self.context_length)
+        token_mask = jnp.repeat(jnp.repeat(pair_mask, 2, axis=1), 2, axis=2)  # [B, 2T, 2T]
+        token_mask &= jnp.tril(jnp.ones((2 * states, 2 * states), bool))
+        # State tokens are the odd ones.
+        features = Transformer(self.config, every_second=True, name="trunk")(
+            tokens, token_mask, deterministic
+        )
+        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+
+
+class MLP(nn.Module):
+    """Dense layers with an activation after each, optionally LayerNorm before it."""
+
+    widths: Sequence[int]
+    activation: str = "relu"
+    layer_norm: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for i, width in enumerate(self.widths):
+            x = nn.Dense(width, kernel_init=nn.initializers.lecun_uniform(), name=f"dense_{i}")(x)
+            if self.layer_norm:
+                x = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name=f"ln_{i}")(x)
+            x = ACTIVATIONS[self.activation](x)
+        return x
+
+
+class MLPActor(nn.Module):
+    """SAC's actor: sees the state alone. Same signature as :class:`TransformerActor`."""
+
+    widths: Sequence[int]
+    activation: str
+    action_size: int
+    head_init_scale: float
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: jax.Array,
+        return_to_go: jax.Array,
+        time_step: jax.Array,
+        state_mask: jax.Array,
+        deterministic: bool = True,
+    ) -> GaussianParams:
+        del return_to_go, time_step, state_mask, deterministic
+        features = MLP(self.widths, self.activation, name="mlp")(obs)
+        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+
+
+class Critic(nn.Module):
+    """Q(s, a): an MLP on the concatenation."""
+
+    widths: Sequence[int]
+    activation: str
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """``obs [..., O]``, ``action [..., A]`` -> ``[...]``."""
+        x = jnp.concatenate([obs, action], axis=-1)
+        x = MLP(self.widths, self.activation, self.layer_norm, name="mlp")(x)
+        return nn.Dense(1, kernel_init=nn.initializers.lecun_uniform(), name="q")(x)[..., 0]
+
+
+def twin_critic(widths: Sequence[int], activation: str, layer_norm: bool) -> nn.Module:
+    """Two independent critics; the output leads with their axis: ``[2, ...]``."""
+    twin = nn.vmap(
+        Critic,
+        variable_axes={"params": 0},
+        split_rngs={"params": True},
+        in_axes=None,
+        out_axes=0,
+        axis_size=2,
+    )
+    return twin(tuple(widths), activation, layer_norm)

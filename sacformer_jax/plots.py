@@ -1,0 +1,48 @@
+"""Pictures of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from sacformer_jax.logging import Record
+
+
+def learning_curve(records: list[Record], path: Path, title: str) -> None:
+    """Draws evaluation and training returns against environment steps into a PNG.
+
+    Args:
+      records: lines of ``metrics.jsonl``.
+      path: file to write.
+      title: above the axes.
+    """
+    evaluations = [r for r in records if r["kind"] == "eval"]
+    episodes = [r for r in records if r["kind"] == "train" and r["episode_return_mean"] is not None]
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    if episodes:
+        axes.plot(
+            [r["env_steps"] for r in episodes],
+            [r["episode_return_mean"] for r in episodes],
+            color="0.65",
+            linewidth=1,
+            label="training episodes (sampled actions)",
+        )
+    if evaluations:
+        steps = [r["env_steps"] for r in evaluations]
+        mean = [r["return_mean"] for r in evaluations]
+        low = [r["return_mean"] - r["return_std"] for r in evaluations]
+        high = [r["return_mean"] + r["return_std"] for r in evaluations]
+        axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
+        axes.plot(
+            steps, mean, color="tab:blue", marker="o", markersize=3, label="evaluation (mean ± std)"
+        )
+    axes.set(xlabel="environment steps", ylabel="episode return", title=title)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    if episodes or evaluations:
+        axes.legend(frameon=False)
+    figure.savefig(path, dpi=130)

@@ -1,0 +1,243 @@
+"""The training program: ``init``, ``prefill`` and ``train_chunk``, pure and jitted once.
+
+One iteration collects a few steps of all environments and then makes the gradient updates that
+``updates_per_env_step`` asks for; a chunk scans many iterations in one donated call.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax import agents, normalizer, rollout
+from sacformer_jax.agents.core import Agent
+from sacformer_jax.buffer import TrajectoryBuffer
+from sacformer_jax.config import Config
+from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.rollout import RolloutState, RolloutStats
+from sacformer_jax.types import (
+    Context,
+    Counters,
+    Hyperparameters,
+    LearnerState,
+    PolicyState,
+    TrainState,
+)
+
+Metrics = dict[str, jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A configuration compiled into pure functions.
+
+    Attributes:
+      config: what it was made from.
+      env: the vectorized training environment.
+      agent: the algorithm.
+      buffer: the replay's functions.
+      init: ``key -> TrainState``.
+      prefill: ``TrainState -> (TrainState, metrics)``, random actions; the argument is donated.
+      train_chunk: ``TrainState -> (TrainState, metrics)``, one chunk; the argument is donated.
+    """
+
+    config: Config
+    env: VectorEnv
+    agent: Agent
+    buffer: TrajectoryBuffer
+    init: jax.stages.Wrapped
+    prefill: jax.stages.Wrapped
+    train_chunk: jax.stages.Wrapped
+
+
+def make_training_env(config: Config) -> VectorEnv:
+    """The configuration's environment, vectorized."""
+    task = config.task
+    env = make_env(task.env, task.engine, task.brax_backend)
+    return VectorEnv(env, task.num_envs, task.max_episode_steps)
+
+
+def make_program(config: Config, env: VectorEnv | None = None) -> Program:
+    """Binds a valid configuration to its pure functions.
+
+    Args:
+      config: see :meth:`Config.validated`.
+      env: use this vectorized environment instead of the one ``config.task`` names.
+
+    Raises:
+      ConfigError: a setting cannot work.
+      ValueError: the environment does not exist.
+    """
+    config.validated()
+    env = make_training_env(config) if env is None else env
+    agent = agents.make(config, env.spec)
+    buffer = TrajectoryBuffer(
+        num_envs=env.num_envs,
+        length=config.replay.buffer_capacity // env.num_envs,
+        obs_size=env.spec.obs_size,
+        action_size=env.spec.action_size,
+        context_length=config.context.context_length,
+        max_episode_steps=env.max_episode_steps,
+        hindsight=config.context.return_conditioning == "hindsight",
+    )
+    functions = _TrainingFunctions(config, env, agent, buffer)
+    return Program(
+        config=config,
+        env=env,
+        agent=agent,
+        buffer=buffer,
+        init=jax.jit(functions.init),
+        prefill=jax.jit(functions.prefill, donate_argnums=0),
+        train_chunk=jax.jit(functions.train_chunk, donate_argnums=0),
+    )
+
+
+def hyperparameters(config: Config, action_size: int) -> Hyperparameters:
+    """The numeric settings as arrays of the train state."""
+    sac, context = config.sac, config.context
+    target_entropy = -float(action_size) if sac.target_entropy is None else sac.target_entropy
+    numbers = {
+        "actor_learning_rate": sac.actor_learning_rate,
+        "critic_learning_rate": sac.critic_learning_rate,
+        "alpha_learning_rate": sac.alpha_learning_rate,
+        "discount": sac.discount,
+        "tau": sac.tau,
+        "target_entropy": target_entropy,
+        "target_return": context.target_return,
+        "return_scale": context.return_scale,
+        "rtg_discount": context.rtg_discount,
+    }
+    return Hyperparameters(**{name: jnp.float32(value) for name, value in numbers.items()})
+
+
+def policy_of(state: TrainState) -> PolicyState:
+    """What acting needs of a train state."""
+    return policy_state(state.learner, state.hyper)
+
+
+def policy_state(learner: LearnerState, hyper: Hyperparameters) -> PolicyState:
+    """What acting needs of a learner."""
+    return PolicyState(
+        actor_params=learner.actor_params,
+        normalizer=learner.normalizer,
+        target_return=hyper.target_return,
+        return_scale=hyper.return_scale,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _TrainingFunctions:
+    """The pure functions behind a :class:`Program`."""
+
+    config: Config
+    env: VectorEnv
+    agent: Agent
+    buffer: TrajectoryBuffer
+
+    def init(self, key: jax.Array) -> TrainState:
+        key, learner_key, env_key = jax.random.split(key, 3)
+        start = rollout.start(self.env, self.buffer, env_key)
+        zero = jnp.zeros((), jnp.int32)
+        return TrainState(
+            learner=self.agent.init(learner_key),
+            hyper=hyperparameters(self.config, self.env.spec.action_size),
+            env=start.env,
+            context=start.context,
+            buffer=start.buffer,
+            counters=Counters(zero, zero, zero, zero),
+            key=key,
+        )
+
+    def prefill(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        def random_action(context: Context, key: jax.Array) -> jax.Array:
+            return self.env.random_action(key)
+
+        state, stats = self._collect(state, random_action, self.config.prefill_vector_steps)
+        return state, _episode_metrics(stats)
+
+    def train_chunk(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        def scanned(state: TrainState, _: None) -> tuple[TrainState, Any]:
+            return self._iteration(state)
+
+        state, (stats, update_metrics) = jax.lax.scan(
+            scanned, state, length=self.config.iterations_per_chunk
+        )
+        means = jax.tree.map(jnp.mean, update_metrics)
+        return state, {**_episode_metrics(stats.total()), **means}
+
+    def _iteration(self, state: TrainState) -> tuple[TrainState, tuple[RolloutStats, Metrics]]:
+        """Collects, then updates; metrics lead with the update axis."""
+        num_steps, num_updates = self.config.steps_and_updates
+        policy = policy_of(state)
+
+        def choose_action(context: Context, key: jax.Array) -> jax.Array:
+            return self.agent.act(policy, context, key)
+
+        state, stats = self._collect(state, choose_action, num_steps)
+
+        def one_update(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
+            sample_key, update_key = jax.random.split(key)
+            window = self.buffer.sample(
+                state.buffer, sample_key, self.config.replay.batch_size, state.hyper.rtg_discount
+            )
+            return self.agent.update(learner, state.hyper, window, update_key)
+
+        key, updates_key = jax.random.split(state.key)
+        learner, metrics = jax.lax.scan(
+            one_update, state.learner, jax.random.split(updates_key, num_updates)
+        )
+        counters = dataclasses.replace(state.counters, updates=state.counters.updates + num_updates)
+        return dataclasses.replace(state, learner=learner, counters=counters, key=key), (
+            stats,
+            metrics,
+        )
+
+    def _collect(
+        self, state: TrainState, choose_action: rollout.ChooseAction, num_steps: int
+    ) -> tuple[TrainState, RolloutStats]:
+        key, collect_key = jax.random.split(state.key)
+        collected, stats, obs = rollout.collect(
+            self.env,
+            self.buffer,
+            choose_action,
+            RolloutState(state.env, state.context, state.buffer),
+            collect_key,
+            num_steps,
+        )
+        learner = state.learner
+        if self.config.context.normalize_obs:
+            learner = dataclasses.replace(
+                learner, normalizer=normalizer.update(learner.normalizer, obs)
+            )
+        counters = state.counters
+        counters = dataclasses.replace(
+            counters,
+            env_steps=counters.env_steps + num_steps * self.env.num_envs,
+            episodes=counters.episodes + stats.episodes,
+            bad_physics=counters.bad_physics + stats.bad_physics,
+        )
+        state = dataclasses.replace(
+            state,
+            learner=learner,
+            env=collected.env,
+            context=collected.context,
+            buffer=collected.buffer,
+            counters=counters,
+            key=key,
+        )
+        return state, stats
+
+
+def _episode_metrics(stats: RolloutStats) -> Metrics:
+    """Means over the finished episodes; NaN where none finished."""
+    episodes = stats.episodes.astype(jnp.float32)
+    return {
+        "episodes": stats.episodes,
+        "episode_return_mean": stats.return_sum / episodes,
+        "episode_return_max": jnp.where(episodes > 0, stats.return_max, jnp.nan),
+        "episode_length_mean": stats.length_sum / episodes,
+        "bad_physics": stats.bad_physics,
+    }

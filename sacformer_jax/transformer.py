@@ -1,0 +1,149 @@
+"""A causal pre-LayerNorm GPT-2 trunk. Nothing about reinforcement learning is in it.
+
+Letters: B sequences, T tokens, S query tokens, H heads, D width.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
+LAYER_NORM_EPSILON = 1e-5
+_MASKED = -1e9
+
+
+@dataclasses.dataclass(frozen=True)
+class TransformerConfig:
+    """Size and details of the trunk.
+
+    Attributes:
+      layers: number of blocks.
+      width: D.
+      heads: H, divides D.
+      mlp_ratio: hidden width of the block's MLP over D.
+      dropout: rate on embeddings, attention weights and both residual branches.
+      activation: one of :data:`ACTIVATIONS`.
+    """
+
+    layers: int
+    width: int
+    heads: int
+    mlp_ratio: int
+    dropout: float
+    activation: str
+
+
+class Dropout(nn.Module):
+    """Inverted dropout from 16 random bits an element, half of what ``nn.Dropout`` draws."""
+
+    rate: float
+
+    @nn.compact
+    def __call__(self, x: jax.Array, deterministic: bool) -> jax.Array:
+        if deterministic or self.rate == 0.0:
+            return x
+        dropped = round(self.rate * 2**16)
+        bits = jax.random.bits(self.make_rng("dropout"), x.shape, jnp.uint16)
+        return jnp.where(bits >= dropped, x / (1.0 - dropped / 2**16), 0.0)
+
+
+class Block(nn.Module):
+    """Attention and MLP with residual connections (GPT-2).
+
+    Attributes:
+      config: the trunk's.
+      every_second: compute only the tokens at odd places; all are still attended to.
+    """
+
+    config: TransformerConfig
+    every_second: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool) -> jax.Array:
+        """``x [B, T, D]``, ``mask [B, T, T]`` (query, key) -> ``[B, S, D]``."""
+        cfg = self.config
+        batch, _, width = x.shape
+        head_width = width // cfg.heads
+        projection = nn.initializers.normal(0.02)
+        dropout = Dropout(cfg.dropout, name="dropout")
+
+        normed = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_1")(x)
+        if self.every_second:
+            x, queries, mask = x[:, 1::2], normed[:, 1::2], mask[:, 1::2]
+            q = nn.Dense(width, kernel_init=projection, name="query")(queries)
+            kv = nn.Dense(2 * width, kernel_init=projection, name="key_value")(normed)
+            k, v = jnp.split(kv, 2, axis=-1)
+        else:
+            qkv = nn.Dense(3 * width, kernel_init=projection, name="query_key_value")(normed)
+            q, k, v = jnp.split(qkv, 3, axis=-1)
+
+        def split_heads(y: jax.Array) -> jax.Array:
+            return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
+
+        q, k, v = split_heads(q), split_heads(k), split_heads(v)
+        scores = jnp.einsum("bhsd,bhtd->bhst", q, k) / jnp.sqrt(head_width)
+        weights = jax.nn.softmax(jnp.where(mask[:, None], scores, _MASKED), axis=-1)
+        mixed = jnp.einsum("bhst,bhtd->bhsd", dropout(weights, deterministic), v)
+        mixed = mixed.swapaxes(1, 2).reshape(batch, -1, width)  # [B, S, D]
+        attended = nn.Dense(width, kernel_init=projection, name="attention_out")(mixed)
+        x = x + dropout(attended, deterministic)
+
+        hidden = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_2")(x)
+        hidden = nn.Dense(cfg.mlp_ratio * width, kernel_init=projection, name="mlp_in")(hidden)
+        hidden = ACTIVATIONS[cfg.activation](hidden)
+        hidden = nn.Dense(width, kernel_init=projection, name="mlp_out")(hidden)
+        return x + dropout(hidden, deterministic)
+
+
+class Transformer(nn.Module):
+    """Blocks and the final LayerNorm over embedded tokens.
+
+    Attributes:
+      config: sizes.
+      every_second: return only the tokens at odd places; the last block then computes only those.
+    """
+
+    config: TransformerConfig
+    every_second: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool = True) -> jax.Array:
+        """Runs the trunk.
+
+        Args:
+          x: ``[B, T, D]`` embedded tokens.
+          mask: bool ``[B, T, T]``, whether a query (axis 1) may attend to a key (axis 2); every
+            query must have at least one.
+          deterministic: dropout off.
+
+        Returns:
+          ``[B, T, D]``, or ``[B, T/2, D]`` with ``every_second``.
+        """
+        x = Dropout(self.config.dropout, name="dropout")(x, deterministic)
+        for i in range(self.config.layers):
+            last = i == self.config.layers - 1
+            block = Block(self.config, self.every_second and last, name=f"block_{i}")
+            x = block(x, mask, deterministic)
+        return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_f")(x)
+
+
+def banded_causal_mask(state_mask: jax.Array, band: int) -> jax.Array:
+    """Which of T places may attend to which: at most the ``band`` newest real ones up to itself.
+
+    A place always attends to itself, so that padding gives finite numbers.
+
+    Args:
+      state_mask: bool ``[B, T]``, real places.
+      band: how many places a query sees, itself included.
+
+    Returns:
+      bool ``[B, T, T]`` (query, key).
+    """
+    place = jnp.arange(state_mask.shape[1])
+    distance = place[:, None] - place[None, :]
+    visible = (distance >= 0) & (distance < band)
+    return (visible & state_mask[:, None, :]) | (distance == 0)

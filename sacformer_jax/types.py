@@ -1,0 +1,227 @@
+"""The structs that flow through training, with their shapes.
+
+Letters: N environments, T ring length per environment, B windows, K context length, O observation
+size, A action size. Everything is float32 unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+
+from sacformer_jax.envs.core import VectorEnvState
+
+Params = Any
+
+
+@flax.struct.dataclass
+class Context:
+    """The last K (return, state) pairs of each running episode, left-padded.
+
+    The newest pair, the state to act on, is the last one. ``[N]`` leads every shape.
+
+    Attributes:
+      obs: ``[N, K, O]`` raw observations.
+      return_so_far: ``[N, K]`` reward collected in the episode before that state.
+      time_step: int32 ``[N, K]`` steps taken in the episode before that state.
+      mask: bool ``[N, K]`` whether the pair exists.
+    """
+
+    obs: jax.Array
+    return_so_far: jax.Array
+    time_step: jax.Array
+    mask: jax.Array
+
+
+@flax.struct.dataclass
+class Window:
+    """A batch of K contiguous steps of one episode each, with the K+1 states around them.
+
+    Attributes:
+      obs: ``[B, K+1, O]`` raw observations; zero where ``state_mask`` is false.
+      action: ``[B, K, A]``.
+      reward: ``[B, K]``.
+      discount: ``[B, K]`` 0 where the task terminated, else 1 (γ is not in it).
+      return_so_far: ``[B, K+1]`` reward collected in the episode before that state.
+      return_to_go: ``[B, K+1]`` obtained from that state to the episode's end, discounted by
+        ``rtg_discount``; zero unless asked for (hindsight).
+      time_step: int32 ``[B, K+1]``.
+      state_mask: bool ``[B, K+1]`` whether the state belongs to the window's episode.
+      mask: bool ``[B, K]`` a real step, for the actor loss.
+      bootstrap_mask: bool ``[B, K]`` its successor is known, or it terminated: for the critic loss.
+      weight: ``[B]`` one over the number of steps in the window: makes the expected weight of
+        every stored step the same although windows at the ends of episodes are short.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    discount: jax.Array
+    return_so_far: jax.Array
+    return_to_go: jax.Array
+    time_step: jax.Array
+    state_mask: jax.Array
+    mask: jax.Array
+    bootstrap_mask: jax.Array
+    weight: jax.Array
+
+
+@flax.struct.dataclass
+class Transition:
+    """One step of N environments, as the buffer stores it.
+
+    Attributes:
+      obs: ``[N, O]`` the observation acted on.
+      action: ``[N, A]``.
+      reward: ``[N]``.
+      terminated: bool ``[N]``.
+      truncated: bool ``[N]``.
+      bad: bool ``[N]`` bad physics: never to be learnt from.
+      time_step: int32 ``[N]`` steps taken in the episode before this one.
+      return_so_far: ``[N]`` reward collected in the episode before this step.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    bad: jax.Array
+    time_step: jax.Array
+    return_so_far: jax.Array
+
+
+@flax.struct.dataclass
+class BufferState:
+    """A ring over time for each environment column.
+
+    Attributes:
+      steps: :class:`Transition` with leaves ``[N, T, ...]``.
+      head: int32, the ring position written next (common to all columns).
+      size: int32, steps stored in each column.
+      running: int32 ``[N]``, newest steps of the column that belong to an unfinished episode.
+    """
+
+    steps: Transition
+    head: jax.Array
+    size: jax.Array
+    running: jax.Array
+
+
+@flax.struct.dataclass
+class Normalizer:
+    """Running mean and variance of observations (Welford, integer count).
+
+    Attributes:
+      count: int32 observations seen.
+      mean: ``[O]``.
+      m2: ``[O]`` sum of squared deviations from the mean.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    m2: jax.Array
+
+
+@flax.struct.dataclass
+class Hyperparameters:
+    """Settings that are plain numbers: part of the train state, so they can be vmapped (scalars).
+
+    Attributes:
+      actor_learning_rate: Adam step size of the actor.
+      critic_learning_rate: Adam step size of the critics.
+      alpha_learning_rate: Adam step size of log α, where α is tuned.
+      discount: γ.
+      tau: soft-update coefficient of the target critics.
+      target_entropy: what tuning α aims at, in nats.
+      target_return: G_1, in units of reward.
+      return_scale: every return-to-go is divided by it before the network sees it.
+      rtg_discount: discount of hindsight return-to-go.
+    """
+
+    actor_learning_rate: jax.Array
+    critic_learning_rate: jax.Array
+    alpha_learning_rate: jax.Array
+    discount: jax.Array
+    tau: jax.Array
+    target_entropy: jax.Array
+    target_return: jax.Array
+    return_scale: jax.Array
+    rtg_discount: jax.Array
+
+
+@flax.struct.dataclass
+class PolicyState:
+    """All that acting needs: actor parameters, normalizer, and the return it is conditioned on."""
+
+    actor_params: Params
+    normalizer: Normalizer
+    target_return: jax.Array
+    return_scale: jax.Array
+
+
+@flax.struct.dataclass
+class LearnerState:
+    """Networks, optimizers, temperature.
+
+    Attributes:
+      actor_params: actor parameters.
+      critic_params: twin critics, leaves ``[2, ...]``.
+      target_critic_params: their slow copies.
+      log_alpha: log of the entropy temperature.
+      actor_opt: Adam state of the actor.
+      critic_opt: Adam state of the critics.
+      alpha_opt: Adam state of log α.
+      normalizer: observation statistics.
+    """
+
+    actor_params: Params
+    critic_params: Params
+    target_critic_params: Params
+    log_alpha: jax.Array
+    actor_opt: Any
+    critic_opt: Any
+    alpha_opt: Any
+    normalizer: Normalizer
+
+
+@flax.struct.dataclass
+class Counters:
+    """Totals since the start of training (int32 scalars).
+
+    Attributes:
+      env_steps: environment steps, prefill included.
+      updates: gradient updates.
+      episodes: finished episodes.
+      bad_physics: steps dropped because the simulation broke down.
+    """
+
+    env_steps: jax.Array
+    updates: jax.Array
+    episodes: jax.Array
+    bad_physics: jax.Array
+
+
+@flax.struct.dataclass
+class TrainState:
+    """Everything training is: restoring it continues the run bit for bit.
+
+    Attributes:
+      learner: networks, optimizers, temperature, normalizer.
+      hyper: numeric hyperparameters.
+      env: states of the N environments.
+      context: the acting contexts.
+      buffer: the trajectory replay.
+      counters: totals.
+      key: typed PRNG key.
+    """
+
+    learner: LearnerState
+    hyper: Hyperparameters
+    env: VectorEnvState
+    context: Context
+    buffer: BufferState
+    counters: Counters
+    key: jax.Array

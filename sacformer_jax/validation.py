@@ -1,0 +1,96 @@
+"""What a configuration must satisfy, each refusal with its reason."""
+
+from __future__ import annotations
+
+from sacformer_jax.config import Config, ConfigError
+
+_AT_LEAST_ONE = (
+    "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
+    "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
+    "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
+    "critic_width",
+)  # fmt: skip
+_POSITIVE = (
+    "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
+    "critic_learning_rate", "alpha", "alpha_learning_rate", "tau",
+)  # fmt: skip
+_AT_MOST_ONE = ("tau", "discount", "rtg_discount")
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise ConfigError(message)
+
+
+def check(config: Config) -> None:
+    """Raises ConfigError naming the first field that cannot work, its value and the remedy."""
+    values = config.flat()
+    for name in _AT_LEAST_ONE:
+        _require(values[name] >= 1, f"{name}={values[name]}: must be at least 1")
+    for name in _POSITIVE:
+        _require(values[name] > 0, f"{name}={values[name]}: must be greater than 0")
+    for name in _AT_MOST_ONE:
+        _require(values[name] <= 1, f"{name}={values[name]}: must be at most 1")
+    for name in ("discount", "rtg_discount", "prefill_env_steps", "seed"):
+        _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
+    _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
+    _check_actor(config)
+    _check_steps(config)
+
+
+def _check_actor(config: Config) -> None:
+    actor, context = config.actor, config.context
+    _require(
+        0 <= actor.actor_dropout < 1,
+        f"actor_dropout={actor.actor_dropout}: must be at least 0 and below 1",
+    )
+    if config.agent == "sac":
+        _require(
+            context.context_length == 1,
+            f"context_length={context.context_length}: agent=sac sees one state; "
+            "use context_length=1, or agent=sacformer",
+        )
+        _require(
+            context.return_conditioning == "none",
+            f"return_conditioning={context.return_conditioning!r}: agent=sac sees no return; "
+            "use return_conditioning=none, or agent=sacformer",
+        )
+    else:
+        _require(
+            actor.actor_width % actor.actor_heads == 0,
+            f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",
+        )
+
+
+def _check_steps(config: Config) -> None:
+    task, run, replay = config.task, config.run, config.replay
+    _require(
+        run.total_env_steps > run.prefill_env_steps,
+        f"total_env_steps={run.total_env_steps}: must be above "
+        f"prefill_env_steps={run.prefill_env_steps}, or nothing is learnt",
+    )
+    _require(
+        run.total_env_steps < 2**31,
+        f"total_env_steps={run.total_env_steps}: must be below 2**31, the counters' range",
+    )
+    steps, updates = config.steps_and_updates
+    _require(
+        steps <= 1000 and updates >= 1,
+        f"updates_per_env_step={replay.updates_per_env_step}: with num_envs={task.num_envs} an "
+        f"iteration would have {steps} steps and {updates} updates; use a simpler fraction",
+    )
+    needed = 1
+    if config.context.return_conditioning == "hindsight":
+        # Only finished episodes have a hindsight return.
+        needed = task.max_episode_steps
+    _require(
+        config.prefill_vector_steps >= needed,
+        f"prefill_env_steps={run.prefill_env_steps}: must be at least {needed * task.num_envs} "
+        f"({needed} for each of num_envs={task.num_envs}), so that there is something to sample",
+    )
+    least = (task.max_episode_steps + config.context.context_length) * task.num_envs
+    _require(
+        replay.buffer_capacity >= least,
+        f"buffer_capacity={replay.buffer_capacity}: must be at least {least}, so that each of "
+        f"num_envs={task.num_envs} holds the longest episode and a window",
+    )
