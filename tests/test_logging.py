@@ -1,0 +1,160 @@
+"""The metric files: appending, JSON values, cutting back on resume, reading."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sacformer_jax.logging import MetricLog, plain, read_records
+
+
+def _open(folder: Path, **kwargs: Any) -> MetricLog:
+    return MetricLog(
+        folder / "metrics.jsonl", folder / "timings.jsonl", folder / "tensorboard", **kwargs
+    )
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    # Standard JSON: NaN and Infinity are not.
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} in {path.name}")
+
+    return [json.loads(line, parse_constant=refuse) for line in path.read_text().splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, None),
+        ("text", "text"),
+        (3, 3),
+        (2.5, 2.5),
+        (math.nan, None),
+        (math.inf, None),
+        (-math.inf, None),
+        (np.float32(0.5), 0.5),
+        (np.float32(np.nan), None),
+        (np.float64(-np.inf), None),
+        (np.int64(7), 7),
+        (np.array(1.25), 1.25),
+        (np.array([4]), 4),
+        (jnp.float32(1.5), 1.5),
+        (jnp.array(jnp.nan), None),
+        (jnp.array(jnp.inf), None),
+        (jnp.int32(-2), -2),
+        (jnp.array(True), True),
+    ],
+    ids=repr,
+)
+def test_plain(value: Any, expected: Any) -> None:
+    converted = plain(value)
+    assert converted == expected
+    assert type(converted) is type(expected)
+
+
+def test_plain_refuses_an_array_of_many() -> None:
+    with pytest.raises(ValueError, match=r"size|item"):
+        plain(np.zeros(2))
+
+
+def test_records_are_appended_as_json_lines(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    first = log.write("train", 100, 50, {"loss": jnp.float32(0.5), "mean": jnp.float32(jnp.nan)})
+    second = log.write("eval", 200, 150, {"return_mean": np.float64(-3.5), "episodes": 4})
+    log.close()
+    assert first == {"kind": "train", "env_steps": 100, "updates": 50, "loss": 0.5, "mean": None}
+    assert _lines(tmp_path / "metrics.jsonl") == [first, second]
+    assert list(second) == ["kind", "env_steps", "updates", "return_mean", "episodes"]
+    assert (tmp_path / "metrics.jsonl").read_bytes().endswith(b"\n")
+
+
+def test_a_record_is_on_disk_at_once(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    record = log.write("eval", 1, 0, {"return_mean": 1.0})
+    log.write_timing(1, 0, {"chunk_seconds": 0.5})
+    assert _lines(tmp_path / "metrics.jsonl") == [record]
+    assert _lines(tmp_path / "timings.jsonl") == [
+        {"env_steps": 1, "updates": 0, "chunk_seconds": 0.5}
+    ]
+    log.close()
+
+
+def test_timings_stay_out_of_the_metrics(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    log.write_timing(10, 5, {"chunk_seconds": 0.25})
+    log.close()
+    assert (tmp_path / "metrics.jsonl").read_bytes() == b""
+
+
+def test_metrics_bytes_counts_everything_written(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    assert log.metrics_bytes == 0
+    log.write("train", 1, 1, {"loss": 1.0})
+    one = log.metrics_bytes
+    assert one == (tmp_path / "metrics.jsonl").stat().st_size > 0
+    log.write("train", 2, 2, {"loss": 1.0})
+    assert log.metrics_bytes == 2 * one
+    log.close()
+
+
+def test_resuming_cuts_the_metrics_back_and_goes_on_after(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = _open(tmp_path)
+    kept = log.write("eval", 100, 0, {"return_mean": 1.0})
+    keep_bytes = log.metrics_bytes
+    log.write("eval", 200, 0, {"return_mean": 2.0})
+    log.close()
+    path.write_bytes(path.read_bytes() + b'{"kind": "train", "env_st')  # killed while writing
+
+    log = _open(tmp_path, keep_bytes=keep_bytes, purge_after=100)
+    assert log.metrics_bytes == keep_bytes
+    again = log.write("eval", 200, 0, {"return_mean": 3.0})
+    log.close()
+    assert _lines(path) == [kept, again]
+
+
+def test_a_new_log_empties_what_lay_there(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text("left over\n")
+    log = _open(tmp_path)
+    record = log.write("train", 1, 1, {})
+    log.close()
+    assert _lines(tmp_path / "metrics.jsonl") == [record]
+
+
+def test_timings_are_kept_on_resume(tmp_path: Path) -> None:
+    for env_steps in (1, 2):
+        log = _open(tmp_path)
+        log.write_timing(env_steps, 0, {"chunk_seconds": 0.5})
+        log.close()
+    assert [line["env_steps"] for line in _lines(tmp_path / "timings.jsonl")] == [1, 2]
+
+
+def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    log.write("eval", 100, 0, {"return_mean": 1.0})
+    log.write_timing(100, 0, {"chunk_seconds": 0.5})
+    log.close()
+    (events,) = (tmp_path / "tensorboard").iterdir()
+    content = events.read_bytes()
+    assert b"eval/return_mean" in content
+    assert b"timing/chunk_seconds" in content
+    assert b"env_steps" not in content  # it is the axis
+
+
+def test_read_records_by_kind(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    train = log.write("train", 1, 1, {"loss": 2.0})
+    evaluation = log.write("eval", 1, 1, {"return_mean": 2.0})
+    later = log.write("train", 2, 2, {"loss": 1.0})
+    log.close()
+    path = tmp_path / "metrics.jsonl"
+    assert read_records(path) == [train, evaluation, later]
+    assert read_records(path, "train") == [train, later]
+    assert read_records(path, "eval") == [evaluation]
+    assert read_records(path, "other") == []

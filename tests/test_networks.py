@@ -1,0 +1,228 @@
+"""The actor against a NumPy forward pass of a GPT-2 decision transformer, and what it may see."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sacformer_jax.networks import TransformerActor, twin_critic
+from sacformer_jax.transformer import Dropout, TransformerConfig, banded_causal_mask
+
+OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
+
+
+def make_actor(layers=3, width=16, heads=1, dropout=0.1, context_length=K):
+    config = TransformerConfig(layers, width, heads, 4, dropout, "relu")
+    return TransformerActor(config, ACT, context_length, MAX_TIME, head_init_scale=1.0)
+
+
+def make_inputs(states=K, seed=0):
+    rng = np.random.default_rng(seed)
+    mask = np.ones((BATCH, states), bool)
+    mask[1, :2] = False  # left-padded, as in acting
+    mask[2, -1:] = False  # padded at the end, as a window past an episode's end
+    return {
+        "obs": rng.normal(size=(BATCH, states, OBS)).astype(np.float32),
+        "return_to_go": rng.normal(size=(BATCH, states)).astype(np.float32),
+        "time_step": rng.integers(0, MAX_TIME, (BATCH, states)).astype(np.int32),
+        "state_mask": mask,
+    }
+
+
+def randomized(params, seed=1, scale=0.4):
+    """Parameters far from their initialization, biases and LayerNorm gains included."""
+    leaves, treedef = jax.tree.flatten(params)
+    rng = np.random.default_rng(seed)
+    noisy = [np.asarray(x + scale * rng.normal(size=x.shape), np.float32) for x in leaves]
+    return jax.tree.unflatten(treedef, noisy)
+
+
+# --- the oracle: plain NumPy in float64 ------------------------------------------------------
+
+
+def layer_norm(x, p):
+    mean, variance = x.mean(-1, keepdims=True), x.var(-1, keepdims=True)
+    return (x - mean) / np.sqrt(variance + 1e-5) * p["scale"] + p["bias"]
+
+
+def dense(x, p):
+    return x @ p["kernel"] + p["bias"]
+
+
+def gpt2_block(x, p, heads, allowed):
+    """Pre-LayerNorm attention and MLP; every token computed."""
+    tokens, width = x.shape
+    h = layer_norm(x, p["ln_1"])
+    if "query_key_value" in p:
+        q, k, v = np.split(dense(h, p["query_key_value"]), 3, axis=-1)
+    else:
+        q = dense(h, p["query"])
+        k, v = np.split(dense(h, p["key_value"]), 2, axis=-1)
+    size = width // heads
+    mixed = np.zeros((tokens, width))
+    for head in range(heads):
+        part = slice(head * size, (head + 1) * size)
+        for i in range(tokens):
+            scores = np.array(
+                [q[i, part] @ k[j, part] / np.sqrt(size) if allowed[i, j] else -np.inf
+                 for j in range(tokens)]
+            )  # fmt: skip
+            weights = np.exp(scores - scores.max())
+            mixed[i, part] = (weights / weights.sum()) @ v[:, part]
+    x = x + dense(mixed, p["attention_out"])
+    h = layer_norm(x, p["ln_2"])
+    return x + dense(np.maximum(dense(h, p["mlp_in"]), 0.0), p["mlp_out"])
+
+
+def oracle(params, inputs, layers, heads, band):
+    params = jax.tree.map(lambda x: np.asarray(x, np.float64), params["params"])
+    means, log_stds = [], []
+    for b in range(BATCH):
+        time = params["embed_time"]["embedding"][inputs["time_step"][b]]
+        g = dense(inputs["return_to_go"][b][:, None].astype(float), params["embed_return"]) + time
+        s = dense(inputs["obs"][b].astype(float), params["embed_state"]) + time
+        states = len(time)
+        x = np.empty((2 * states, g.shape[1]))
+        x[0::2], x[1::2] = g, s
+        x = layer_norm(x, params["ln_embed"])
+        allowed = np.zeros((2 * states, 2 * states), bool)
+        for i in range(2 * states):
+            for j in range(i + 1):
+                same_pair = i // 2 == j // 2
+                in_band = i // 2 - j // 2 < band
+                allowed[i, j] = in_band and (same_pair or inputs["state_mask"][b, j // 2])
+        for layer in range(layers):
+            x = gpt2_block(x, params["trunk"][f"block_{layer}"], heads, allowed)
+        x = layer_norm(x, params["trunk"]["ln_f"])[1::2]
+        means.append(dense(x, params["heads"]["mean"]))
+        log_stds.append(np.clip(dense(x, params["heads"]["log_std"]), -20.0, 2.0))
+    return np.stack(means), np.stack(log_stds)
+
+
+@pytest.mark.parametrize(("layers", "heads", "states"), [(3, 1, K), (2, 2, K), (2, 4, K + 1)])
+def test_actor_equals_the_numpy_decision_transformer(layers, heads, states):
+    actor = make_actor(layers=layers, heads=heads)
+    inputs = make_inputs(states)
+    params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
+    out = jax.jit(actor.apply)(params, **inputs)
+    mean, log_std = oracle(params, inputs, layers, heads, band=K)
+    real = inputs["state_mask"]
+    np.testing.assert_allclose(out.mean[real], mean[real], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(out.log_std[real], log_std[real], rtol=1e-5, atol=1e-5)
+    assert np.isfinite(out.mean).all()  # padding too
+    assert (log_std[real] < 2.0).any()  # the clip is not all there is
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A one-block actor, where the band is the whole receptive field."""
+    actor = make_actor(layers=1)
+    inputs = make_inputs(K + 2)
+    inputs["state_mask"][:] = True
+    params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
+    return jax.jit(actor.apply), params, inputs
+
+
+def test_step_t_does_not_depend_on_later_steps(trained):
+    apply, params, inputs = trained
+    before = apply(params, **inputs)
+    for t in range(K + 1):
+        changed = {name: np.array(value) for name, value in inputs.items()}
+        changed["obs"][:, t + 1 :] += 3.0
+        changed["return_to_go"][:, t + 1 :] -= 2.0
+        changed["time_step"][:, t + 1 :] = 7
+        after = apply(params, **changed)
+        np.testing.assert_array_equal(after.mean[:, : t + 1], before.mean[:, : t + 1])
+        assert not np.allclose(after.mean[:, t + 1], before.mean[:, t + 1])
+
+
+def test_masked_steps_do_not_matter(trained):
+    apply, params, inputs = trained
+    masked = {name: np.array(value) for name, value in inputs.items()}
+    masked["state_mask"][:, 1] = False
+    before = apply(params, **masked)
+    masked["obs"][:, 1] = 1e3
+    masked["return_to_go"][:, 1] = -1e3
+    masked["time_step"][:, 1] = 0
+    after = apply(params, **masked)
+    others = [0, 2, 3, 4, 5]
+    np.testing.assert_array_equal(after.mean[:, others], before.mean[:, others])
+    assert not np.allclose(before.mean[:, 2], apply(params, **inputs).mean[:, 2])
+
+
+def test_no_more_than_k_pairs_are_seen(trained):
+    apply, params, inputs = trained
+    before = apply(params, **inputs)
+    changed = {name: np.array(value) for name, value in inputs.items()}
+    changed["obs"][:, 0] += 5.0
+    after = apply(params, **changed)
+    np.testing.assert_array_equal(after.mean[:, K:], before.mean[:, K:])
+    assert not np.allclose(after.mean[:, K - 1], before.mean[:, K - 1])
+
+
+def test_the_action_depends_on_the_return_and_the_time_step(trained):
+    apply, params, inputs = trained
+    before = apply(params, **inputs)
+    for name in ("return_to_go", "time_step"):
+        changed = {**inputs, name: inputs[name] + np.ones_like(inputs[name])}
+        assert not np.allclose(apply(params, **changed).mean, before.mean)
+
+
+def test_left_padding_equals_a_shorter_sequence(trained):
+    apply, params, inputs = trained
+    short = {name: value[:, 2:] for name, value in inputs.items()}
+    padded = {name: np.array(value) for name, value in inputs.items()}
+    padded["state_mask"][:, :2] = False
+    np.testing.assert_allclose(
+        apply(params, **padded).mean[:, 2:], apply(params, **short).mean, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_banded_causal_mask_by_hand():
+    mask = banded_causal_mask(jnp.array([[False, True, True, True]]), band=2)
+    assert mask[0].astype(int).tolist() == [
+        [1, 0, 0, 0],  # not real, but attends to itself
+        [0, 1, 0, 0],
+        [0, 1, 1, 0],
+        [0, 0, 1, 1],
+    ]
+
+
+def test_dropout_rate_and_mean():
+    x = jnp.ones((400, 500))
+    dropout = Dropout(0.1)
+    y = dropout.apply({}, x, False, rngs={"dropout": jax.random.key(0)})
+    assert np.mean(np.asarray(y) == 0.0) == pytest.approx(0.1, abs=0.004)
+    assert np.mean(y) == pytest.approx(1.0, abs=0.005)
+    np.testing.assert_array_equal(dropout.apply({}, x, True), x)
+
+
+def test_dropout_is_on_only_where_asked_for():
+    actor = make_actor(dropout=0.5)
+    inputs = make_inputs()
+    params = jax.jit(actor.init)(jax.random.key(0), **inputs)
+    apply = jax.jit(actor.apply, static_argnames="deterministic")
+
+    def mean(key):
+        return apply(params, **inputs, deterministic=False, rngs={"dropout": key}).mean
+
+    assert not np.allclose(mean(jax.random.key(0)), mean(jax.random.key(1)))
+    np.testing.assert_array_equal(mean(jax.random.key(0)), mean(jax.random.key(0)))
+
+
+def test_twin_critics_are_two_mlps():
+    critic = twin_critic((8, 8), "relu", layer_norm=False)
+    rng = np.random.default_rng(0)
+    obs, action = rng.normal(size=(7, OBS)), rng.normal(size=(7, ACT))
+    params = jax.jit(critic.init)(jax.random.key(0), obs, action)
+    q = jax.jit(critic.apply)(params, obs, action)
+    assert q.shape == (2, 7)
+    assert not np.allclose(q[0], q[1])
+    for i in range(2):
+        p = jax.tree.map(lambda x, i=i: np.asarray(x[i], np.float64), params["params"])
+        x = np.concatenate([obs, action], axis=-1)
+        for layer in ("dense_0", "dense_1"):
+            x = np.maximum(dense(x, p["mlp"][layer]), 0.0)
+        np.testing.assert_allclose(q[i], dense(x, p["q"])[:, 0], rtol=1e-4, atol=1e-5)

@@ -1,0 +1,351 @@
+"""Whole runs: what they write, that resuming equals never having stopped, and their policies."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sacformer_jax.logging as metric_logging
+from sacformer_jax import (
+    CheckpointError,
+    Config,
+    ConfigError,
+    Policy,
+    RunResult,
+    evaluate,
+    load_policy,
+    make_program,
+    resume,
+    train,
+)
+from sacformer_jax.checkpoint import RunFolder, digest
+from sacformer_jax.logging import read_records
+from sacformer_jax.types import Context
+
+TOTAL, STOP = 600, 400
+TINY = {
+    "env": "Hopper", "num_envs": 2, "max_episode_steps": 50, "prefill_env_steps": 200,
+    "chunk_env_steps": 100, "total_env_steps": TOTAL, "eval_every": 200, "eval_episodes": 2,
+    "checkpoint_every": 200, "actor_width": 8, "actor_heads": 1, "actor_layers": 1,
+    "critic_width": 8, "batch_size": 4, "buffer_capacity": 2000, "normalize_obs": True,
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """A run and what it printed."""
+
+    result: RunResult
+    printed: str
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """A run from start to end, quiet; not to be changed."""
+    path = tmp_path_factory.mktemp("runs") / "straight"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        result = train(Config.from_preset("cpu", **TINY, run_dir=str(path)), quiet=True)
+    return Outcome(result, printed.getvalue())
+
+
+@pytest.fixture(scope="module")
+def resumed(straight: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """The same run killed after its checkpoint at ``STOP`` (but before the next) and resumed.
+
+    What it had written since then is still there, the last line only in part.
+    """
+    path = tmp_path_factory.mktemp("runs") / "resumed"
+    shutil.copytree(straight.result.path, path)
+    shutil.rmtree(path / "checkpoints" / str(TOTAL))
+    (path / "learning_curve.png").unlink()
+    metrics = path / "metrics.jsonl"
+    metrics.write_bytes(metrics.read_bytes() + b'{"kind": "eval", "env_steps": 800}\n{"kind": "tr')
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        result = resume(path)
+    return Outcome(result, printed.getvalue())
+
+
+@pytest.fixture(scope="module")
+def policy(straight: Outcome) -> Policy:
+    return load_policy(straight.result.path)
+
+
+def _contents(path: Path) -> dict[str, bytes]:
+    """Every file under a folder."""
+    files = (file for file in path.rglob("*") if file.is_file())
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def _state_digest(path: Path) -> str:
+    """Digest of the whole train state of the newest checkpoint."""
+    folder = RunFolder(path)
+    program = make_program(folder.read_config().config)
+    return digest(folder.restore(jax.eval_shape(program.init, jax.random.key(0))).state)
+
+
+# --- resuming ----------------------------------------------------------------------------------
+
+
+def test_resuming_equals_never_having_stopped(straight: Outcome, resumed: Outcome) -> None:
+    assert f"resuming at  {STOP} env steps" in resumed.printed
+    assert resumed.result.env_steps == straight.result.env_steps == TOTAL
+    paths = straight.result.path, resumed.result.path
+    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
+    best = [load_policy(path, "best").state for path in paths]
+    assert digest(best[0]) == digest(best[1])
+    assert [p.name for p in (paths[0] / "best").iterdir()] == [
+        p.name for p in (paths[1] / "best").iterdir()
+    ]
+
+
+def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed: Outcome) -> None:
+    assert resumed.result.evaluations == straight.result.evaluations
+    assert not resumed.result.interrupted
+    assert (resumed.result.path / "learning_curve.png").is_file()
+
+
+def test_a_finished_run_is_not_resumed(straight: Outcome) -> None:
+    before = _contents(straight.result.path)
+    for total in (None, TOTAL, STOP):
+        with pytest.raises(ConfigError, match=r"total_env_steps=\d+: .* 600 already"):
+            resume(straight.result.path, total)
+    assert _contents(straight.result.path) == before
+
+
+def test_training_into_a_run_refuses_and_leaves_it_alone(straight: Outcome) -> None:
+    path = straight.result.path
+    before = _contents(path)
+    with pytest.raises(CheckpointError, match="holds a run already") as refused:
+        train(Config.from_preset("cpu", **{**TINY, "seed": 1}, run_dir=str(path)), quiet=True)
+    assert f"sacformer resume {path}" in str(refused.value)
+    assert _contents(path) == before
+
+
+# --- what a run writes -------------------------------------------------------------------------
+
+
+def test_quiet_prints_nothing(straight: Outcome) -> None:
+    assert straight.printed == ""
+
+
+def test_the_result(straight: Outcome) -> None:
+    result = straight.result
+    assert not result.interrupted
+    assert result.env_steps == TOTAL
+    assert result.evaluations == read_records(result.path / "metrics.jsonl", "eval")
+
+
+def test_metrics_come_when_they_should(straight: Outcome) -> None:
+    records = read_records(straight.result.path / "metrics.jsonl")
+    # Prefill is 200 steps; then one update per environment step, in chunks of 100.
+    assert [(r["kind"], r["env_steps"], r["updates"]) for r in records] == [
+        ("eval", 200, 0),
+        ("train", 300, 100),
+        ("train", 400, 200),
+        ("eval", 400, 200),
+        ("train", 500, 300),
+        ("train", 600, 400),
+        ("eval", 600, 400),
+    ]
+
+
+TRAIN_FIELDS = {
+    "episodes", "episode_return_mean", "episode_return_max", "episode_length_mean", "bad_physics",
+    "critic_loss", "actor_loss", "q_mean", "entropy", "alpha", "actor_grad_norm",
+    "critic_grad_norm",
+}  # fmt: skip
+EVAL_FIELDS = {
+    "episodes", "return_mean", "return_std", "return_min", "return_max", "length_mean",
+}  # fmt: skip
+TIMING_FIELDS = {
+    "chunk_seconds", "steps_per_second", "ms_per_update", "wall_seconds",
+}  # fmt: skip
+
+
+def test_the_schema_is_documented() -> None:
+    text = metric_logging.__doc__ or ""
+    train_text, rest = text.split('``kind = "train"``')[1].split('``kind = "eval"``')
+    eval_text, timing_text = rest.split("``timings.jsonl``")
+    assert set(re.findall(r"``(\w+)``", train_text)) - {"null"} == TRAIN_FIELDS
+    assert set(re.findall(r"``(\w+)``", eval_text)) == EVAL_FIELDS
+    assert set(re.findall(r"``(\w+)``", timing_text)) - {"env_steps", "updates"} == TIMING_FIELDS
+
+
+def test_metrics_obey_their_schema(straight: Outcome) -> None:
+    path = straight.result.path / "metrics.jsonl"
+    assert path.read_bytes().endswith(b"\n")
+    for record in read_records(path):
+        assert list(record)[:3] == ["kind", "env_steps", "updates"]
+        expected = TRAIN_FIELDS if record["kind"] == "train" else EVAL_FIELDS
+        assert set(record) - {"kind", "env_steps", "updates"} == expected
+        for name in ("env_steps", "updates", "episodes"):
+            assert type(record[name]) is int
+        # Hopper falls long before two chunks are over, so no mean is missing here.
+        assert all(isinstance(record[name], int | float) for name in expected)
+
+
+def test_metrics_make_sense(straight: Outcome) -> None:
+    for record in read_records(straight.result.path / "metrics.jsonl", "train"):
+        assert record["episodes"] >= 1
+        assert 1 <= record["episode_length_mean"] <= 50
+        assert record["episode_return_max"] >= record["episode_return_mean"]
+        assert record["bad_physics"] == 0
+        assert record["critic_loss"] > 0
+        assert 0 < record["alpha"] < 0.2  # tuned down from its first value
+        assert record["actor_grad_norm"] > 0
+        assert record["critic_grad_norm"] > 0
+    for record in straight.result.evaluations:
+        assert record["episodes"] == 2
+        assert record["return_min"] <= record["return_mean"] <= record["return_max"]
+        # Of two values, the standard deviation is half their distance.
+        spread = (record["return_max"] - record["return_min"]) / 2
+        assert record["return_std"] == pytest.approx(spread, rel=1e-3, abs=1e-4)
+        assert 1 <= record["length_mean"] <= 50
+
+
+def test_timings_obey_their_schema(straight: Outcome) -> None:
+    records = read_records(straight.result.path / "timings.jsonl")
+    assert [record["env_steps"] for record in records] == [300, 400, 500, 600]
+    assert [record["updates"] for record in records] == [100, 200, 300, 400]
+    for record in records:
+        assert set(record) == TIMING_FIELDS | {"env_steps", "updates"}
+        assert all(record[name] > 0 for name in TIMING_FIELDS)
+        speed = record["steps_per_second"]
+        assert record["chunk_seconds"] * speed == pytest.approx(100)
+        assert record["ms_per_update"] * speed == pytest.approx(1000)
+
+
+def test_checkpoints_come_when_they_should(straight: Outcome) -> None:
+    path = straight.result.path
+    assert {p.name for p in (path / "checkpoints").iterdir()} == {"400", "600"}
+    best = max(straight.result.evaluations, key=lambda record: record["return_mean"])
+    assert [p.name for p in (path / "best").iterdir()] == [str(best["env_steps"])]
+
+
+def test_learning_curve_is_a_png(straight: Outcome) -> None:
+    content = (straight.result.path / "learning_curve.png").read_bytes()
+    assert content.startswith(b"\x89PNG\r\n\x1a\n")
+    assert content.endswith(b"IEND\xaeB`\x82")
+    width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
+    assert width > height > 300
+
+
+def test_tensorboard_events_are_written(straight: Outcome) -> None:
+    content = b"".join(_contents(straight.result.path / "tensorboard").values())
+    for tag in (b"eval/return_mean", b"train/critic_loss", b"timing/steps_per_second"):
+        assert tag in content
+
+
+def test_config_json_tells_where_values_come_from(straight: Outcome) -> None:
+    contents = json.loads((straight.result.path / "config.json").read_text())
+    config = Config.from_dict(contents["config"])
+    assert {name: config.flat()[name] for name in TINY} == TINY
+    given = {name for name, source in contents["sources"].items() if source == "given"}
+    assert given >= {"env", "actor_width", "run_dir"}
+    assert "tau" not in given
+    assert contents["env_spec"]["obs_size"] == 11
+
+
+# --- the policy --------------------------------------------------------------------------------
+
+
+def _observations(count: int) -> np.ndarray:
+    return np.random.default_rng(5).normal(size=(count, 11)).astype(np.float32)
+
+
+def _predictions(policy: Policy, observations: np.ndarray, rewards: np.ndarray) -> np.ndarray:
+    """Actions of an episode; ``rewards[i]`` is what step ``i`` gave."""
+    policy.reset()
+    before = [0.0, *rewards[:-1]]
+    return np.stack(
+        [policy.predict(obs, reward) for obs, reward in zip(observations, before, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("which", ["best", "latest"])
+def test_predict_is_within_bounds_and_repeats_after_reset(straight: Outcome, which: str) -> None:
+    policy = load_policy(straight.result.path, which)
+    observations, rewards = 10 * _observations(9), np.linspace(-5, 5, 9)
+    actions = _predictions(policy, observations, rewards)
+    assert actions.shape == (9, 3)
+    assert actions.dtype == np.float32
+    assert (actions >= np.array(policy.spec.action_low)).all()
+    assert (actions <= np.array(policy.spec.action_high)).all()
+    assert len(np.unique(actions, axis=0)) == 9
+    np.testing.assert_array_equal(_predictions(policy, observations, rewards), actions)
+
+
+def test_predict_ignores_the_reward_only_after_reset(policy: Policy) -> None:
+    first, second = _observations(2)
+    policy.reset()
+    action = policy.predict(first)
+    policy.reset()
+    np.testing.assert_array_equal(policy.predict(first, 1e6), action)
+    after_one = policy.predict(second, 1.0)
+    policy.reset()
+    policy.predict(first)
+    assert not np.array_equal(policy.predict(second, 1e3), after_one)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 6, 8])
+def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, steps: int) -> None:
+    length = policy.config.context.context_length
+    assert length == 6
+    observations, rewards = _observations(steps), np.arange(1, steps + 1, dtype=np.float32)
+    seen = min(steps, length)
+    obs = np.zeros((1, length, 11), np.float32)
+    return_so_far = np.zeros((1, length), np.float32)
+    time_step = np.zeros((1, length), np.int32)
+    mask = np.zeros((1, length), bool)
+    for place, step in enumerate(range(steps - seen, steps), start=length - seen):
+        obs[0, place] = observations[step]
+        return_so_far[0, place] = rewards[:step].sum()
+        time_step[0, place] = step
+        mask[0, place] = True
+    context = Context(*(jnp.asarray(x) for x in (obs, return_so_far, time_step, mask)))
+    expected = policy.agent.act(policy.state, context, None)[0]
+    action = _predictions(policy, observations, rewards)[-1]
+    np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(10,), (12,), (1, 11), ()], ids=str)
+def test_an_observation_of_another_shape_is_refused(policy: Policy, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"must be \(11,\)") as refused:
+        policy.predict(np.zeros(shape, np.float32))
+    assert str(shape) in str(refused.value)
+
+
+def test_a_policy_loads_without_the_replay(straight: Outcome, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(straight.result.path, path)
+    removed = [*(path / "checkpoints").glob("*/state")]
+    assert len(removed) == 2
+    for folder in removed:
+        shutil.rmtree(folder)
+    for which in ("best", "latest"):
+        state = load_policy(path, which).state
+        assert digest(state) == digest(load_policy(straight.result.path, which).state)
+
+
+def test_evaluate_on_our_own_environment(straight: Outcome) -> None:
+    record: dict[str, Any] = evaluate(straight.result.path, episodes=3, seed=4)
+    assert list(record) == ["env", "episodes", "return_mean", "return_std", "length_mean"]
+    assert record["env"] == "Hopper"
+    assert record["episodes"] == 3
+    assert 1 <= record["length_mean"] <= 50
+    with pytest.raises(ConfigError, match="episodes=0"):
+        evaluate(straight.result.path, episodes=0)

@@ -1,0 +1,291 @@
+"""The update against hand-computed NumPy values and an independent two-pass reference."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from probe import point_config, point_env
+
+from sacformer_jax import agents
+from sacformer_jax.agents.sac_update import bellman_target, soft_update, weighted_mean
+from sacformer_jax.networks import TransformerActor, twin_critic
+from sacformer_jax.train import hyperparameters
+from sacformer_jax.transformer import TransformerConfig
+from sacformer_jax.types import Window
+
+B, K = 5, 3
+
+
+def make_window(seed=0, context_length=K) -> Window:
+    """Windows with every kind of step: terminated, truncated, newest, padded, bad physics."""
+    rng = np.random.default_rng(seed)
+    k = context_length
+    state_mask = np.ones((B, k + 1), bool)
+    discount = np.ones((B, k), np.float32)
+    bootstrap = np.ones((B, k), bool)
+    state_mask[1, -1] = False
+    discount[1, -1] = 0.0  # terminated at the last step
+    state_mask[2, -1] = False
+    bootstrap[2, -1] = False  # truncated: successor unknown
+    mask = state_mask[:, :-1].copy()
+    if k > 1:
+        state_mask[3, 0], mask[3, 0], bootstrap[3, 0] = False, False, False  # padding
+        mask[4, -1], bootstrap[4, -1] = False, False  # bad physics
+    return Window(
+        obs=jnp.asarray(rng.normal(size=(B, k + 1, 2)), jnp.float32),
+        action=jnp.asarray(rng.uniform(-1, 1, (B, k, 1)), jnp.float32),
+        reward=jnp.asarray(rng.normal(size=(B, k)), jnp.float32),
+        discount=jnp.asarray(discount),
+        return_so_far=jnp.asarray(rng.normal(size=(B, k + 1)), jnp.float32),
+        return_to_go=jnp.asarray(rng.normal(size=(B, k + 1)), jnp.float32),
+        time_step=jnp.asarray(rng.integers(0, 9, (B, k + 1)), jnp.int32),
+        state_mask=jnp.asarray(state_mask),
+        mask=jnp.asarray(mask),
+        bootstrap_mask=jnp.asarray(bootstrap),
+        weight=jnp.asarray(1.0 / np.maximum(state_mask[:, :-1].sum(1), 1), jnp.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def setup():
+    config = point_config(context_length=K)
+    env = point_env(1)
+    agent = agents.make(config, env.spec)
+    learner = jax.jit(agent.init)(jax.random.key(0))
+    return config, env.spec, jax.jit(agent.update), learner, hyperparameters(config, 1)
+
+
+def networks(config, spec):
+    actor = TransformerActor(
+        TransformerConfig(1, 16, 1, 4, 0.0, "relu"), 1, K, spec.max_episode_steps + 1, 0.01
+    )
+    return actor, twin_critic((32, 32), "relu", False)
+
+
+# --- by hand ---------------------------------------------------------------------------------
+
+
+def test_bellman_target_at_ordinary_and_terminated_steps():
+    y = bellman_target(
+        reward=jnp.array([[1.0, 2.0]]),
+        discount=0.9 * jnp.array([[1.0, 0.0]]),  # the second step terminated
+        next_q=jnp.array([[[10.0, 50.0]], [[8.0, 70.0]]]),
+        next_log_prob=jnp.array([[-2.0, 3.0]]),
+        alpha=jnp.float32(0.5),
+    )
+    # 1 + 0.9 (min(10, 8) - 0.5 (-2)) and 2 alone.
+    np.testing.assert_allclose(y, [[9.1, 2.0]], rtol=1e-6)
+
+
+def test_weighted_mean_and_soft_update():
+    values = jnp.array([[1.0, 2.0], [3.0, 100.0]])
+    assert weighted_mean(values, jnp.array([[0.5, 0.5], [1.0, 0.0]])) == pytest.approx(2.25)
+    assert weighted_mean(values, jnp.zeros((2, 2))) == 0.0
+    moved = soft_update({"w": jnp.array([1.0])}, {"w": jnp.array([3.0])}, jnp.float32(0.005))
+    np.testing.assert_allclose(moved["w"], [1.01])
+
+
+def numpy_mlp(params, x):
+    for layer in ("dense_0", "dense_1"):
+        x = np.maximum(x @ params["mlp"][layer]["kernel"] + params["mlp"][layer]["bias"], 0.0)
+    return (x @ params["q"]["kernel"] + params["q"]["bias"])[..., 0]
+
+
+def numpy_q(params, obs, action):
+    x = np.concatenate([obs, action], axis=-1)
+    both = [jax.tree.map(lambda p, i=i: np.asarray(p[i], float), params["params"]) for i in (0, 1)]
+    return np.stack([numpy_mlp(p, x) for p in both])
+
+
+def numpy_sample(gaussian, key):
+    """The tanh-Gaussian on [-1, 1], written out."""
+    mean, log_std = (np.asarray(x, float) for x in (gaussian.mean, gaussian.log_std))
+    noise = np.asarray(jax.random.normal(key, mean.shape), float)
+    u = mean + np.exp(log_std) * noise
+    log_prob = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi) - np.log(1 - np.tanh(u) ** 2)
+    return np.tanh(u), log_prob.sum(-1)
+
+
+def test_losses_on_a_fixed_batch_equal_numpy(setup):
+    config, spec, update, learner, hyper = setup
+    learner = dataclasses.replace(learner, log_alpha=jnp.float32(np.log(0.3)))
+    window, key = make_window(), jax.random.key(7)
+    _, metrics = update(learner, hyper, window, key)
+
+    actor, _ = networks(config, spec)
+    gaussian = actor.apply(
+        learner.actor_params,
+        window.obs,
+        (0.0 - window.return_so_far) / 10.0,  # commanded: (target - so far) / scale
+        window.time_step,
+        window.state_mask,
+    )
+    _, next_key, action_key = jax.random.split(key, 3)
+    obs = np.asarray(window.obs, float)
+    following = jax.tree.map(lambda x: x[:, 1:], gaussian)
+    next_action, next_log_prob = numpy_sample(following, next_key)
+    next_q = numpy_q(learner.target_critic_params, obs[:, 1:], next_action).min(0)
+    reward, discount = np.asarray(window.reward), np.asarray(window.discount)
+    y = reward + 0.99 * discount * (next_q - 0.3 * next_log_prob)
+    q = numpy_q(learner.critic_params, obs[:, :-1], np.asarray(window.action, float))
+
+    # Means over the real steps of a window, then over windows: written as loops.
+    weight, mask = np.asarray(window.weight), np.asarray(window.bootstrap_mask)
+    total = norm = 0.0
+    for b in range(B):
+        for k in range(K):
+            if mask[b, k]:
+                total += weight[b] * ((q[0, b, k] - y[b, k]) ** 2 + (q[1, b, k] - y[b, k]) ** 2)
+                norm += weight[b]
+    assert float(metrics["critic_loss"]) == pytest.approx(total / norm, rel=1e-4)
+
+    current = jax.tree.map(lambda x: x[:, :-1], gaussian)
+    _, log_prob = numpy_sample(current, action_key)
+    actor_weight = weight[:, None] * np.asarray(window.mask)
+    entropy = -(actor_weight * log_prob).sum() / actor_weight.sum()
+    assert float(metrics["entropy"]) == pytest.approx(entropy, rel=1e-4)
+    assert float(metrics["alpha"]) == pytest.approx(0.3, rel=1e-6)
+
+
+def test_alpha_gradient_sign_and_first_adam_step(setup):
+    _, _, update, learner, hyper = setup
+    window = make_window()
+    for target, direction in ((100.0, 1.0), (-100.0, -1.0)):  # far above, far below
+        wanted = dataclasses.replace(hyper, target_entropy=jnp.float32(target))
+        new, _ = update(learner, wanted, window, jax.random.key(0))
+        # Adam's first step is one learning rate against the gradient's sign.
+        step = float(new.log_alpha - learner.log_alpha)
+        assert step == pytest.approx(direction * 1e-3, rel=1e-3)
+
+
+def test_what_is_masked_does_not_matter(setup):
+    _, _, update, learner, hyper = setup
+    window, key = make_window(), jax.random.key(1)
+    before, metrics_before = update(learner, hyper, window, key)
+    garbage = np.asarray(window.reward).copy()
+    garbage[~np.asarray(window.bootstrap_mask)] = 1e3
+    action = np.asarray(window.action).copy()
+    action[~np.asarray(window.mask)] = 0.9
+    obs = np.asarray(window.obs).copy()
+    obs[~np.asarray(window.state_mask)] = 5.0  # the states after terminated and truncated steps
+    changed = dataclasses.replace(
+        window, reward=jnp.asarray(garbage), action=jnp.asarray(action), obs=jnp.asarray(obs)
+    )
+    after, metrics_after = update(learner, hyper, changed, key)
+    assert float(metrics_after["critic_loss"]) == pytest.approx(
+        float(metrics_before["critic_loss"]), rel=1e-5
+    )
+    for a, b in zip(
+        jax.tree.leaves((before.actor_params, before.critic_params)),
+        jax.tree.leaves((after.actor_params, after.critic_params)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+# --- one pass against two --------------------------------------------------------------------
+
+
+def two_pass_update(config, spec, learner, hyper, window, key):
+    """The same update with a pass of its own for π_t and for π_{t+1}, and optax's Adam."""
+    actor, critic = networks(config, spec)
+    _, next_key, action_key = jax.random.split(key, 3)
+    k = window.action.shape[1]
+    return_to_go = (hyper.target_return - window.return_so_far) / hyper.return_scale
+    alpha = jnp.exp(learner.log_alpha)
+
+    def policy(params, states):
+        return actor.apply(
+            params,
+            window.obs[:, :states],
+            return_to_go[:, :states],
+            window.time_step[:, :states],
+            window.state_mask[:, :states],
+        )
+
+    def sample(mean, log_std, key):
+        noise = jax.random.normal(key, mean.shape)
+        u = mean + jnp.exp(log_std) * noise
+        log_prob = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+        log_prob -= 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
+        return jnp.tanh(u), log_prob.sum(-1)
+
+    following = policy(learner.actor_params, k + 1)
+    next_action, next_log_prob = sample(following.mean[:, 1:], following.log_std[:, 1:], next_key)
+    next_q = critic.apply(learner.target_critic_params, window.obs[:, 1:], next_action).min(0)
+    y = window.reward + hyper.discount * window.discount * (next_q - alpha * next_log_prob)
+
+    def mean_over(values, mask):
+        weights = window.weight[:, None] * mask
+        return (values * weights).sum() / weights.sum()
+
+    def critic_loss(params):
+        q = critic.apply(params, window.obs[:, :-1], window.action)
+        return mean_over((q[0] - y) ** 2 + (q[1] - y) ** 2, window.bootstrap_mask)
+
+    def step(params, grads, learning_rate):
+        adam = optax.adam(learning_rate)
+        changes, _ = adam.update(grads, adam.init(params))
+        return optax.apply_updates(params, changes)
+
+    critic_grads = jax.grad(critic_loss)(learner.critic_params)
+    critic_params = step(learner.critic_params, critic_grads, hyper.critic_learning_rate)
+
+    def actor_loss(params):
+        current = policy(params, k)
+        action, log_prob = sample(current.mean, current.log_std, action_key)
+        q = critic.apply(critic_params, window.obs[:, :-1], action).min(0)
+        return mean_over(alpha * log_prob - q, window.mask), log_prob
+
+    grads, log_prob = jax.grad(actor_loss, has_aux=True)(learner.actor_params)
+    alpha_grad = jax.grad(
+        lambda log_alpha: mean_over(
+            -jnp.exp(log_alpha) * (log_prob + hyper.target_entropy), window.mask
+        )
+    )(learner.log_alpha)
+    actor_params = step(learner.actor_params, grads, hyper.actor_learning_rate)
+    log_alpha = step(learner.log_alpha, alpha_grad, hyper.alpha_learning_rate)
+    return actor_params, critic_params, log_alpha
+
+
+def test_one_pass_equals_two_passes(setup):
+    config, spec, update, learner, hyper = setup
+    window, key = make_window(3), jax.random.key(9)
+    new, _ = update(learner, hyper, window, key)
+    actor_params, critic_params, log_alpha = jax.jit(
+        lambda learner, window: two_pass_update(config, spec, learner, hyper, window, key)
+    )(learner, window)
+    ours = (new.actor_params, new.critic_params, new.log_alpha)
+    reference = (actor_params, critic_params, log_alpha)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(reference), strict=True):
+        # Adam's first step divides by the gradient's size: rounding shows where it is tiny.
+        np.testing.assert_allclose(a, b, atol=3e-5)
+    target = soft_update(learner.target_critic_params, critic_params, hyper.tau)
+    for a, b in zip(
+        jax.tree.leaves(new.target_critic_params), jax.tree.leaves(target), strict=True
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.parametrize("conditioning", ["hindsight", "none"])
+def test_conditioning_decides_what_the_actor_is_shown(setup, conditioning):
+    _, spec, _, learner, hyper = setup
+    prefill = {"prefill_env_steps": 4 * 20}
+    config = point_config(context_length=K, return_conditioning=conditioning, **prefill)
+    update = jax.jit(agents.make(config, spec).update)
+    window, key = make_window(), jax.random.key(2)
+
+    def entropy(**changes):
+        return float(
+            update(learner, hyper, dataclasses.replace(window, **changes), key)[1]["entropy"]
+        )
+
+    base = entropy()
+    assert entropy(return_so_far=window.return_so_far + 3.0) == base
+    shows_return = conditioning == "hindsight"
+    assert (entropy(return_to_go=window.return_to_go + 3.0) != base) == shows_return
