@@ -14,6 +14,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +65,23 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Restored:
-    """A checkpoint read back and verified."""
+    """A checkpoint read back and verified.
+
+    Attributes:
+      state: the whole train state.
+      progress: of the host loop.
+      host_threads: CPU threads of the process that wrote it; sums are split over them, so only
+        the same number continues bit for bit.
+    """
 
     state: TrainState
     progress: Progress
+    host_threads: int
+
+
+def host_threads() -> int:
+    """CPU threads this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def digest(tree: Any) -> str:
@@ -186,7 +200,7 @@ class RunFolder:
             "progress": dataclasses.asdict(progress),
             "state_digest": digest(state),
             "policy_digest": digest(policy),
-            "host_threads": len(jax.devices()),
+            "host_threads": host_threads(),
         }
         with self._manager("checkpoints", KEEP) as manager:
             if progress.env_steps in manager.all_steps():
@@ -244,7 +258,7 @@ class RunFolder:
                 f"checkpoint {self.path / 'checkpoints' / str(step)} is damaged (its digest "
                 "differs): remove that folder to fall back to the one before"
             )
-        return Restored(state, Progress(**metadata["progress"]))
+        return Restored(state, Progress(**metadata["progress"]), metadata["host_threads"])
 
     def restore_policy(self, agent: Agent, which: str) -> PolicyState:
         """Reads the ``"best"`` or ``"latest"`` policy and verifies its digest.

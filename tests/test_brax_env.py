@@ -26,16 +26,11 @@ def test_unknown_names_and_backends_are_refused_with_what_there_is():
     assert {"ant", "halfcheetah", "hopper", "humanoid", "walker2d"} <= set(brax_names())
 
 
-def test_spec():
-    spec = make_env("brax:inverted_pendulum", brax_backend="generalized").spec
-    assert (spec.name, spec.engine) == ("brax:inverted_pendulum", "brax generalized")
-    assert (spec.obs_size, spec.action_size) == (4, 1)
-    assert (spec.action_low, spec.action_high) == ((-1.0,), (1.0,))
-    assert spec.max_episode_steps == 1000
-    assert spec.gymnasium_id is None
-
-
-@pytest.fixture(scope="module", params=BACKENDS)
+# The default backend quickly; the others compile for half a minute each.
+@pytest.fixture(
+    scope="module",
+    params=["spring", *(pytest.param(b, marks=pytest.mark.slow) for b in BACKENDS[1:])],
+)
 def pendulum(request):
     """Two pendulums pushed one way until they fall, with automatic resets; and brax's own."""
     backend = request.param
@@ -56,6 +51,7 @@ def pendulum(request):
     first_obs, states, step, time_step = jax.device_get(rollout(jax.random.key(0)))
     return SimpleNamespace(
         backend=backend,
+        spec=env.env.spec,
         theirs=theirs,
         rollout=rollout,
         actions=np.asarray(actions),
@@ -64,6 +60,15 @@ def pendulum(request):
         step=step,
         time_step=time_step,
     )
+
+
+def test_spec(pendulum):
+    spec = pendulum.spec
+    assert (spec.name, spec.engine) == ("brax:inverted_pendulum", f"brax {pendulum.backend}")
+    assert (spec.obs_size, spec.action_size) == (4, 1)
+    assert (spec.action_low, spec.action_high) == ((-1.0,), (1.0,))
+    assert spec.max_episode_steps == 1000
+    assert spec.gymnasium_id is None
 
 
 def test_steps_are_finite_and_move(pendulum):
@@ -102,7 +107,8 @@ def test_resets_are_freshly_random(pendulum):
 
 def test_step_is_braxs_own_step_from_the_same_state(pendulum):
     their_step = jax.jit(pendulum.theirs.step)
-    for t, env in ((0, 0), (1, 1), (steps_of_termination(pendulum)[0], 0), (NUM_STEPS - 1, 1)):
+    falls = np.flatnonzero(pendulum.step.terminated[:, 0])[0]
+    for t, env in ((0, 0), (1, 1), (falls, 0), (NUM_STEPS - 1, 1)):
         state = jax.tree.map(lambda x, i=(t, env): jnp.asarray(x[i]), pendulum.states.env)
         expected = their_step(state, pendulum.actions[t, env])
         ours = jax.tree.map(lambda x, i=(t, env): x[i], pendulum.step)
@@ -110,7 +116,3 @@ def test_step_is_braxs_own_step_from_the_same_state(pendulum):
         np.testing.assert_allclose(ours.obs, expected.obs, rtol=1e-4, atol=1e-5)
         assert ours.reward == expected.reward
         assert bool(ours.terminated) is bool(expected.done > 0.5)
-
-
-def steps_of_termination(pendulum) -> list[int]:
-    return np.flatnonzero(pendulum.step.terminated[:, 0]).tolist()

@@ -317,7 +317,8 @@ def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, steps: in
         time_step[0, place] = step
         mask[0, place] = True
     context = Context(*(jnp.asarray(x) for x in (obs, return_so_far, time_step, mask)))
-    expected = policy.agent.act(policy.state, context, None)[0]
+    act = jax.jit(lambda state, context: policy.agent.act(state, context, None))
+    expected = act(policy.state, context)[0]
     action = _predictions(policy, observations, rewards)[-1]
     np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
 
