@@ -31,7 +31,7 @@ resume: install  ## continue `make train` where it stopped
 	$(BIN)/sacformer evaluate $(RUN) --gymnasium --episodes 10
 
 test: install  ## the quick tests (under 12 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not slow" $(FLAGS)
+	$(BIN)/python -m pytest -n 2 --dist loadscope -m "not slow" $(FLAGS)
 
 test-all: install  ## every test, the slow ones too
 	$(BIN)/python -m pytest $(FLAGS)

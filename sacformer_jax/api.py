@@ -42,6 +42,8 @@ def evaluate(
 
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed={seed}: must be at least 0 and below 2**32")
     loaded = load_policy(run, policy)
     if gymnasium:
         return evaluate_policy(loaded, episodes, seed).record()

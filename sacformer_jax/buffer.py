@@ -13,6 +13,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.config import ConfigError
 from sacformer_jax.context import discounted_suffix_sums
 from sacformer_jax.types import BufferState, Transition, Window
 
@@ -32,7 +33,7 @@ class TrajectoryBuffer:
         episodes are drawn.
 
     Raises:
-      ValueError: a column cannot hold the longest episode plus a window.
+      ConfigError: a column cannot hold the longest episode plus a window.
     """
 
     num_envs: int
@@ -46,7 +47,7 @@ class TrajectoryBuffer:
     def __post_init__(self) -> None:
         needed = self.max_episode_steps + self.context_length
         if self.length < needed:
-            raise ValueError(
+            raise ConfigError(
                 f"buffer_capacity={self.length * self.num_envs} over num_envs={self.num_envs} "
                 f"gives {self.length} steps each: must be at least max_episode_steps + "
                 f"context_length = {needed} each, so buffer_capacity >= {needed * self.num_envs}"

@@ -25,6 +25,7 @@ import orbax.checkpoint as ocp
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.train import policy_state
 from sacformer_jax.types import Hyperparameters, PolicyState, TrainState
 from sacformer_jax.version import __version__
 
@@ -90,9 +91,9 @@ def digest(tree: Any) -> str:
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.random.key_data(leaf)
-        array = np.ascontiguousarray(leaf)
+        array = np.asarray(leaf)
         sha.update(f"{jax.tree_util.keystr(path)}|{array.dtype}|{array.shape}|".encode())
-        sha.update(array.data)
+        sha.update(array.tobytes())
     return sha.hexdigest()
 
 
@@ -128,9 +129,10 @@ class RunFolder:
         """Makes the folder and writes ``config.json``.
 
         Raises:
-          CheckpointError: the folder holds a run already, or cannot be written.
+          CheckpointError: the folder holds a run with a checkpoint already (one that was stopped
+            before its first may be started again), or cannot be written.
         """
-        if (self.path / "config.json").exists():
+        if self.latest_step() is not None:
             raise CheckpointError(
                 f"run_dir={str(self.path)!r} holds a run already: "
                 f"continue it with 'sacformer resume {self.path}' or choose another folder"
@@ -169,7 +171,9 @@ class RunFolder:
         try:
             contents = json.loads(path.read_text())
             made_with = contents["format"]
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            if made_with == FORMAT and not {"config", "sources", "env_spec"} <= set(contents):
+                raise KeyError("config, sources or env_spec")
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, OSError) as error:
             raise CheckpointError(f"{path} is damaged: restore it from a copy") from error
         if made_with != FORMAT:
             raise CheckpointError(
@@ -234,7 +238,7 @@ class RunFolder:
 
     def latest_step(self) -> int | None:
         """Environment steps of the newest checkpoint; None without any."""
-        with self._manager("checkpoints", KEEP) as manager:
+        with self._manager("checkpoints", None) as manager:
             return manager.latest_step()
 
     def restore(self, abstract_state: TrainState) -> Restored:
@@ -321,6 +325,4 @@ def _abstract_policy(agent: Agent) -> PolicyState:
     learner = jax.eval_shape(agent.init, jax.random.key(0))
     number: Any = jax.ShapeDtypeStruct((), np.float32)
     fields = {field.name: number for field in dataclasses.fields(Hyperparameters)}
-    from sacformer_jax.train import policy_state
-
     return policy_state(learner, Hyperparameters(**fields))

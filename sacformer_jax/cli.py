@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import tyro
@@ -22,6 +22,9 @@ EXIT_BAD_INPUT = 2
 """Exit code of refused input."""
 EXIT_INTERRUPTED = 3
 """Exit code of a run stopped by SIGINT or SIGTERM after saving a checkpoint."""
+
+EXIT_KILLED = 130
+"""Exit code of a program stopped by SIGINT before it could save (the shell's convention)."""
 
 _USAGE = """usage: sacformer COMMAND ...
 
@@ -53,7 +56,7 @@ class EvaluateArgs:
     """In a real gymnasium.make environment, beside random actions; otherwise on our own."""
     episodes: int = 10
     """Number of episodes."""
-    policy: str = "best"
+    policy: Literal["best", "latest"] = "best"
     """Which policy: best or latest."""
     seed: int = 0
     """Seed of the resets."""
@@ -90,8 +93,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refused(f"command {args[0]!r} does not exist; there are {', '.join(commands)}")
     try:
         return commands[args[0]](args[1:])
-    except (ConfigError, CheckpointError, ValueError) as error:
+    except (ConfigError, CheckpointError) as error:
         return _refused(str(error))
+    except KeyboardInterrupt:
+        print("stopped at once; what was saved before is intact", file=sys.stderr)
+        return EXIT_KILLED
 
 
 def _refused(message: str) -> int:
@@ -102,18 +108,19 @@ def _refused(message: str) -> int:
 def _parse_config(args: list[str], prog: str) -> Resolved:
     """Reads flags over the preset's values for the agent and environment they name."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", default="cpu")
-    first.add_argument("--agent")
-    first.add_argument("--env")
+    # A flag without its value is left for the real parser to refuse.
+    first.add_argument("--preset", nargs="?", default="cpu", const="cpu")
+    first.add_argument("--agent", nargs="?")
+    first.add_argument("--env", nargs="?")
     chosen = vars(first.parse_known_args(args)[0])
     preset = chosen.pop("preset")
     base = resolve(preset, {name: value for name, value in chosen.items() if value is not None})
     config = tyro.cli(
         Annotated[Config, tyro.conf.OmitArgPrefixes], args=args, default=base.config, prog=prog
     )
-    flat, base_flat = config.flat(), base.config.flat()
-    given = {name: value for name, value in flat.items() if value != base_flat[name]}
-    given.update({name: flat[name] for name, value in chosen.items() if value is not None})
+    flags = {arg.split("=")[0].lstrip("-").replace("-", "_") for arg in args if arg[:2] == "--"}
+    names = flags | {flag.removeprefix("no_") for flag in flags}
+    given = {name: value for name, value in config.flat().items() if name in names}
     return resolve(preset, given, "command line")
 
 
@@ -199,7 +206,7 @@ def _describe_run(parsed: DescribeArgs) -> int:
 def _print_config(resolved: Resolved) -> None:
     for name, value in resolved.config.flat().items():
         shown = repr(value) if value in ("", None) else str(value)
-        print(f"{name:<24}{shown:<16}{resolved.sources[name]}")
+        print(f"{name:<24}{shown:<15} {resolved.sources[name]}")
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ class RunConfig:
     """How long, and what is kept."""
 
     total_env_steps: int = 1_000_000
-    """Environment steps of the whole run, prefill included, over all environments."""
+    """Environment steps of the whole run, prefill included; rounded up to whole chunks."""
     prefill_env_steps: int = 10_000
     """Environment steps under uniformly random actions before the first update."""
     eval_every: int = 2_000
@@ -290,7 +290,7 @@ def _coerced(name: str, value: Any, kind: Any) -> Any:
             return None
         kind = next(k for k in typing.get_args(kind) if k is not type(None))
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        value = float(value) if abs(value) < 2**1000 else math.inf
     if kind is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):

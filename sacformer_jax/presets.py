@@ -120,6 +120,7 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
         raise ConfigError(f"preset={preset!r}: must be one of {', '.join(PRESETS)}")
     config = Config().replace(preset=preset)
     sources = dict.fromkeys(config.flat(), "default (the paper's, or plain)")
+    sources["preset"] = "default of the command line"
     chosen = config.replace(**{k: v for k, v in fields.items() if k in ("agent", "env")})
     layers = [
         layer
@@ -129,5 +130,4 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
     for layer in [*layers, Layer(given, fields)]:
         config = config.replace(**layer.values)
         sources.update(dict.fromkeys(layer.values, layer.source))
-    sources["preset"] = given
     return Resolved(config, sources)

@@ -123,6 +123,7 @@ def sources_of(config: Config) -> dict[str, str]:
     chosen = {"agent": config.agent, "env": config.task.env}
     base = resolve(config.preset, chosen)
     given = {name for name, value in base.config.flat().items() if flat[name] != value}
+    given.add("preset")
     return {name: "given" if name in given else base.sources[name] for name in flat}
 
 

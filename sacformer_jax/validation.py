@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sacformer_jax.config import Config, ConfigError
 
 _AT_LEAST_ONE = (
@@ -28,7 +30,13 @@ def check(config: Config) -> None:
     for name in _AT_LEAST_ONE:
         _require(values[name] >= 1, f"{name}={values[name]}: must be at least 1")
     for name in _POSITIVE:
-        _require(values[name] > 0, f"{name}={values[name]}: must be greater than 0")
+        _require(bool(np.float32(values[name]) > 0), f"{name}={values[name]}: must be greater than 0")
+    for name, value in values.items():
+        if isinstance(value, float):
+            _require(
+                abs(value) <= float(np.finfo(np.float32).max),
+                f"{name}={value}: is beyond the range of float32",
+            )
     for name in _AT_MOST_ONE:
         _require(values[name] <= 1, f"{name}={values[name]}: must be at most 1")
     for name in ("discount", "rtg_discount", "prefill_env_steps", "seed"):
@@ -78,6 +86,17 @@ def _check_steps(config: Config) -> None:
         steps <= 1000 and updates >= 1,
         f"updates_per_env_step={replay.updates_per_env_step}: with num_envs={task.num_envs} an "
         f"iteration would have {steps} steps and {updates} updates; use a simpler fraction",
+    )
+    _require(
+        abs(updates / (steps * task.num_envs) / replay.updates_per_env_step - 1) < 1e-3,
+        f"updates_per_env_step={replay.updates_per_env_step}: is not a fraction with a "
+        "denominator up to 1000; the smallest is 0.001",
+    )
+    learning_steps = run.total_env_steps - run.prefill_env_steps
+    _require(
+        learning_steps * replay.updates_per_env_step < 2**31,
+        f"updates_per_env_step={replay.updates_per_env_step}: makes over 2**31 updates in "
+        f"total_env_steps={run.total_env_steps}, beyond the counters' range",
     )
     needed = 1
     if config.context.return_conditioning == "hindsight":

@@ -93,6 +93,12 @@ def assert_trees_equal(actual, expected) -> None:
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
+def assert_rewards_close(step, reference: SimpleNamespace) -> None:
+    """Within 1e-5 of the largest term, since terms of both signs cancel in the sum."""
+    scale = np.max(np.abs(list(reference.terms.values())), axis=0)
+    assert np.all(np.abs(step.reward - reference.reward) <= 1e-5 * scale)
+
+
 def random_noise(engine: NativeEngine, *shape: int) -> ResetNoise:
     rng = np.random.default_rng(7)
     qpos = rng.uniform(-0.1, 0.1, (*shape, engine.nq)).astype(np.float32)
@@ -195,9 +201,7 @@ def test_rewards_and_their_terms_equal_gymnasiums(case):
     for name in expected:
         np.testing.assert_allclose(terms[name], expected[name], rtol=1e-5, atol=1e-12, err_msg=name)
         assert np.any(expected[name] != 0), f"{name} is never tested"
-    # Terms of both signs cancel in the sum, so its error is relative to the largest of them.
-    scale = np.max(np.abs(list(expected.values())), axis=0)
-    assert np.all(np.abs(case.step.reward - case.reference.reward) <= 1e-5 * scale)
+    assert_rewards_close(case.step, case.reference)
 
 
 def test_terminations_equal_gymnasiums(case):
@@ -211,7 +215,8 @@ def test_rewards_far_from_the_origin(case):
     physics, _ = case.env.engine.unpack_state(case.far_words)
     assert np.all(case.far_reference.qpos[:, 0] > 400.0)
     np.testing.assert_array_equal(physics, case.far_reference.physics)
-    np.testing.assert_allclose(case.far_step.reward, case.far_reference.reward, rtol=0, atol=1e-3)
+    assert_rewards_close(case.far_step, case.far_reference)
+    assert np.max(np.abs(case.far_step.reward - case.far_reference.reward)) < 1e-3
 
 
 def test_a_state_is_complete_and_nothing_stale_leaks_into_a_step(case):
@@ -315,6 +320,8 @@ def test_two_programs_at_once_get_their_own_results(ant, monkeypatch):
     def guarded(worker, *args):
         # An MjData in two threads' hands at once is the bug to catch, lucky results or not.
         shared.append(id(worker) in busy)
+        if shared[-1]:
+            return  # stepping would crash the process
         users.add((id(worker), threading.get_ident()))
         busy.add(id(worker))
         step(worker, *args)

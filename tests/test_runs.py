@@ -39,6 +39,8 @@ TINY = {
     "chunk_env_steps": 100, "total_env_steps": TOTAL, "eval_every": 200, "eval_episodes": 2,
     "checkpoint_every": 200, "actor_width": 8, "actor_heads": 1, "actor_layers": 1,
     "critic_width": 8, "batch_size": 4, "buffer_capacity": 2000, "normalize_obs": True,
+    "updates_per_env_step": 1.0, "context_length": 6, "return_conditioning": "commanded",
+    "actor_dropout": 0.0, "tune_alpha": True, "alpha": 0.2,
 }  # fmt: skip
 
 
@@ -276,9 +278,7 @@ def _predictions(policy: Policy, observations: np.ndarray, rewards: np.ndarray) 
     )
 
 
-@pytest.mark.parametrize("which", ["best", "latest"])
-def test_predict_is_within_bounds_and_repeats_after_reset(straight: Outcome, which: str) -> None:
-    policy = load_policy(straight.result.path, which)
+def test_predict_is_within_bounds_and_repeats_after_reset(policy: Policy) -> None:
     observations, rewards = 10 * _observations(9), np.linspace(-5, 5, 9)
     actions = _predictions(policy, observations, rewards)
     assert actions.shape == (9, 3)
@@ -301,11 +301,9 @@ def test_predict_ignores_the_reward_only_after_reset(policy: Policy) -> None:
     assert not np.array_equal(policy.predict(second, 1e3), after_one)
 
 
-@pytest.mark.parametrize("steps", [1, 3, 6, 8])
-def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, steps: int) -> None:
-    length = policy.config.context.context_length
-    assert length == 6
-    observations, rewards = _observations(steps), np.arange(1, steps + 1, dtype=np.float32)
+def _context_by_hand(observations: np.ndarray, rewards: np.ndarray, length: int) -> Context:
+    """The context at the last observation, ``rewards[i]`` being what step ``i`` gave."""
+    steps = len(observations)
     seen = min(steps, length)
     obs = np.zeros((1, length, 11), np.float32)
     return_so_far = np.zeros((1, length), np.float32)
@@ -316,11 +314,16 @@ def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, steps: in
         return_so_far[0, place] = rewards[:step].sum()
         time_step[0, place] = step
         mask[0, place] = True
-    context = Context(*(jnp.asarray(x) for x in (obs, return_so_far, time_step, mask)))
+    return Context(*(jnp.asarray(x) for x in (obs, return_so_far, time_step, mask)))
+
+
+def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy) -> None:
     act = jax.jit(lambda state, context: policy.agent.act(state, context, None))
-    expected = act(policy.state, context)[0]
-    action = _predictions(policy, observations, rewards)[-1]
-    np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
+    for steps in (1, 3, 6, 8):  # K is 6
+        observations, rewards = _observations(steps), np.arange(1, steps + 1, dtype=np.float32)
+        expected = act(policy.state, _context_by_hand(observations, rewards, 6))[0]
+        action = _predictions(policy, observations, rewards)[-1]
+        np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(10,), (12,), (1, 11), ()], ids=str)
@@ -328,6 +331,15 @@ def test_an_observation_of_another_shape_is_refused(policy: Policy, shape: tuple
     with pytest.raises(ValueError, match=r"must be \(11,\)") as refused:
         policy.predict(np.zeros(shape, np.float32))
     assert str(shape) in str(refused.value)
+
+
+def test_the_latest_policy_acts_too(straight: Outcome, policy: Policy) -> None:
+    latest = load_policy(straight.result.path, "latest")
+    observation = _observations(1)[0]
+    policy.reset()
+    best_is_latest = digest(latest.state) == digest(policy.state)
+    same = np.array_equal(latest.predict(observation), policy.predict(observation))
+    assert same == best_is_latest
 
 
 def test_a_policy_loads_without_the_replay(straight: Outcome, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import Env, EnvSpec, EnvStep, VectorEnv, VectorEnvState, VectorStep
 from sacformer_jax.envs.physics import ENGINES
 from sacformer_jax.envs.tasks import TASKS
@@ -31,7 +32,7 @@ def make_env(name: str, engine: str = "auto", brax_backend: str = "spring") -> E
       brax_backend: ``"spring"``, ``"positional"``, ``"generalized"`` or ``"mjx"``.
 
     Raises:
-      ValueError: an unknown name (the message lists what exists), engine or backend.
+      ConfigError: an unknown name (the message lists what exists), engine or backend.
     """
     if name.startswith(BRAX_PREFIX):
         from sacformer_jax.envs.brax_env import BraxEnv
@@ -41,7 +42,7 @@ def make_env(name: str, engine: str = "auto", brax_backend: str = "spring") -> E
         from sacformer_jax.envs.brax_env import brax_names
 
         known = [*TASKS, *(BRAX_PREFIX + brax_name for brax_name in brax_names())]
-        raise ValueError(f"env={name!r}: no such environment; there are {', '.join(known)}")
+        raise ConfigError(f"env={name!r}: no such environment; there are {', '.join(known)}")
     from sacformer_jax.envs.mujoco_env import MujocoEnv
 
     return MujocoEnv(name, engine)

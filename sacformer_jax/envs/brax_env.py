@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
-from brax import envs as brax_envs
 
-from sacformer_jax.config import BraxBackend
+from sacformer_jax.config import BraxBackend, ConfigError
 from sacformer_jax.envs.core import EnvSpec, EnvStep, JaxEnv
+
+with contextlib.redirect_stdout(sys.stderr):  # brax says on stdout which extras it misses
+    from brax import envs as brax_envs
 
 BACKENDS = get_args(BraxBackend)
 
@@ -27,15 +31,15 @@ class BraxEnv(JaxEnv):
       backend: physics backend.
 
     Raises:
-      ValueError: no such environment or backend.
+      ConfigError: no such environment or backend.
     """
 
     def __init__(self, name: str, backend: str = "spring"):
         if name not in brax_names():
             known = ", ".join(f"brax:{known}" for known in brax_names())
-            raise ValueError(f"env='brax:{name}': no such environment; there are {known}")
+            raise ConfigError(f"env='brax:{name}': no such environment; there are {known}")
         if backend not in BACKENDS:
-            raise ValueError(f"brax_backend={backend!r}: must be one of {', '.join(BACKENDS)}")
+            raise ConfigError(f"brax_backend={backend!r}: must be one of {', '.join(BACKENDS)}")
         self._env = brax_envs.get_environment(name, backend=backend)
         # Brax's policies act in the unit box; where the actuators' range is another, brax scales.
         unit = (1.0,) * self._env.action_size

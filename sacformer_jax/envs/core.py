@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sacformer_jax.config import ConfigError
+
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
@@ -185,15 +187,15 @@ class VectorEnv:
       max_episode_steps: the time limit; default: the environment's own.
 
     Raises:
-      ValueError: ``num_envs`` or ``max_episode_steps`` is below 1.
+      ConfigError: ``num_envs`` or ``max_episode_steps`` is below 1.
     """
 
     def __init__(self, env: Env, num_envs: int, max_episode_steps: int | None = None):
         if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs}: must be at least 1")
+            raise ConfigError(f"num_envs={num_envs}: must be at least 1")
         limit = env.spec.max_episode_steps if max_episode_steps is None else max_episode_steps
         if limit < 1:
-            raise ValueError(f"max_episode_steps={limit}: must be at least 1")
+            raise ConfigError(f"max_episode_steps={limit}: must be at least 1")
         self.env = env
         self.num_envs = num_envs
         self.max_episode_steps = limit

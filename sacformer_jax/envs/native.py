@@ -128,6 +128,13 @@ class _Worker:
         out[self.num_physics :] = self.measure()
 
 
+def _ignore_warning(message: str) -> None:
+    """Instead of MuJoCo's own handler, which writes MUJOCO_LOG.TXT into the working directory.
+
+    Nothing is lost: an unstable simulation is read off ``MjData.warning``.
+    """
+
+
 class NativeEngine:
     """C MuJoCo behind the engine signature of :mod:`sacformer_jax.envs.physics`.
 
@@ -137,6 +144,7 @@ class NativeEngine:
     """
 
     def __init__(self, task: Task, num_threads: int | None = None):
+        mujoco.set_mju_user_warning(_ignore_warning)
         self.model = mujoco.MjModel.from_xml_path(str(model_path(task)))
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
         self.dt = float(self.model.opt.timestep * task.frame_skip)

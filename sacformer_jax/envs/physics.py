@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import flax.struct
 import jax
 
+from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.tasks import Quantities, Task
 
 ENGINES = ("auto", "native")
@@ -84,10 +85,10 @@ def resolve_engine(engine: str) -> tuple[str, str]:
     """The engine that ``engine`` stands for, and why: ``("native", "CPU backend")``.
 
     Raises:
-      ValueError: ``engine`` is not one of :data:`ENGINES`.
+      ConfigError: ``engine`` is not one of :data:`ENGINES`.
     """
     if engine not in ENGINES:
-        raise ValueError(f"engine={engine!r}: must be one of {', '.join(ENGINES)}")
+        raise ConfigError(f"engine={engine!r}: must be one of {', '.join(ENGINES)}")
     if engine == "auto":
         return "native", f"auto: C MuJoCo on the host, JAX backend is {jax.default_backend()}"
     return engine, "as asked for"
