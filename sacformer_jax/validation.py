@@ -30,7 +30,9 @@ def check(config: Config) -> None:
     for name in _AT_LEAST_ONE:
         _require(values[name] >= 1, f"{name}={values[name]}: must be at least 1")
     for name in _POSITIVE:
-        _require(bool(np.float32(values[name]) > 0), f"{name}={values[name]}: must be greater than 0")
+        _require(
+            bool(np.float32(values[name]) > 0), f"{name}={values[name]}: must be greater than 0"
+        )
     for name, value in values.items():
         if isinstance(value, float):
             _require(
