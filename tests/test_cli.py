@@ -232,6 +232,7 @@ def test_bad_settings_are_refused_in_a_line(
         (["resume", "somewhere", "--total-env-steps", "many"], "many"),
         (["evaluate", "somewhere", "--episodes", "few"], "few"),
         (["evaluate", "somewhere", "--video"], "--video"),
+        (["evaluate", "somewhere", "--policy", "worst"], "worst"),
     ],
     ids=str,
 )
@@ -283,7 +284,6 @@ def run_without_checkpoint(tmp_path: Path) -> Path:
         ("resume", [], "no checkpoint yet"),
         ("evaluate", [], "no best policy yet"),
         ("evaluate", ["--policy", "latest"], "no latest policy yet"),
-        ("evaluate", ["--policy", "worst"], "'worst'"),
         ("evaluate", ["--episodes", "0"], "episodes=0"),
     ],
 )
@@ -310,7 +310,11 @@ def test_a_damaged_run_is_refused(run, run_without_checkpoint: Path) -> None:
         _assert_refused(run(command, run_without_checkpoint), "config.json", "damaged")
 
 
-def test_a_run_is_not_trained_over(run, run_without_checkpoint: Path) -> None:
+def test_a_run_is_not_trained_over(
+    run, run_without_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As if it had a checkpoint; tests/test_runs.py does the same with a real one.
+    monkeypatch.setattr(RunFolder, "latest_step", lambda self: STOP)
     said = run("train", *_flags(TINY), "--run-dir", run_without_checkpoint)
     _assert_refused(said, f"sacformer resume {run_without_checkpoint}")
 

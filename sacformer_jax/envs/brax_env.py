@@ -45,7 +45,7 @@ class BraxEnv(JaxEnv):
         unit = (1.0,) * self._env.action_size
         self.spec = EnvSpec(
             name=f"brax:{name}",
-            obs_size=int(self._env.observation_size),
+            obs_size=jax.eval_shape(self._env.reset, jax.random.key(0)).obs.shape[-1],
             action_size=int(self._env.action_size),
             action_low=tuple(-bound for bound in unit),
             action_high=unit,

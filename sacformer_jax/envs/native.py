@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import jax
@@ -33,6 +33,9 @@ _BAD_WARNINGS = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
     for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
 ]
+# MuJoCo prints a warning, and writes MUJOCO_LOG.TXT into the working directory, only when its
+# counter is 0; counting from here keeps it quiet, and nothing is lost.
+_WARNED_BEFORE = 1000
 _DERIVED_COLUMNS = {"cinert": 10, "cvel": 6, "cfrc_ext": 6}
 
 
@@ -105,13 +108,13 @@ class _Worker:
         model, data = self.model, self.data
         mujoco.mj_setState(model, data, state[: self.num_physics], _STATE_SPEC)
         data.ctrl[:] = ctrl
-        self.warnings[:] = 0
+        self.warnings[:] = _WARNED_BEFORE
         mujoco.mj_step(model, data, nstep=self.frame_skip)
         mujoco.mj_rnePostConstraint(model, data)
         self._write(out, row)
         measured = self.measure()
         row[self.displacement] = measured - state[self.num_physics :]
-        row[self.bad] = self.warnings[_BAD_WARNINGS].any()
+        row[self.bad] = (self.warnings[_BAD_WARNINGS] != _WARNED_BEFORE).any()
         out[self.num_physics :] = measured
 
     def reset(
@@ -128,11 +131,16 @@ class _Worker:
         out[self.num_physics :] = self.measure()
 
 
-def _ignore_warning(message: str) -> None:
-    """Instead of MuJoCo's own handler, which writes MUJOCO_LOG.TXT into the working directory.
+def _load_model(task: Task) -> mujoco.MjModel:
+    """Compiles the task's model without the warnings about its old attributes.
 
-    Nothing is lost: an unstable simulation is read off ``MjData.warning``.
+    MuJoCo's own handler would print them and write MUJOCO_LOG.TXT into the working directory.
     """
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        return mujoco.MjModel.from_xml_path(str(model_path(task)))
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 class NativeEngine:
@@ -144,8 +152,7 @@ class NativeEngine:
     """
 
     def __init__(self, task: Task, num_threads: int | None = None):
-        mujoco.set_mju_user_warning(_ignore_warning)
-        self.model = mujoco.MjModel.from_xml_path(str(model_path(task)))
+        self.model = _load_model(task)
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
         self.dt = float(self.model.opt.timestep * task.frame_skip)
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
@@ -223,7 +230,6 @@ class NativeEngine:
         self, words: Any, ctrl: Any, reset: Any, qpos_noise: Any, qvel_noise: Any
     ) -> tuple[np.ndarray, ...]:
         """All environments, any leading shape; ``words is None`` steps none."""
-        self.host_calls += 1
         reset_mask = np.asarray(reset)
         batch_shape, resets = reset_mask.shape, reset_mask.reshape(-1)
         num = resets.size
@@ -261,6 +267,10 @@ class NativeEngine:
                 self._pool.submit(work, self._workers[k], bounds[k], bounds[k + 1])
                 for k in range(1, shares)
             ]
-            work(self._workers[0], bounds[0], bounds[1])
+            self.host_calls += 1
+            try:
+                work(self._workers[0], bounds[0], bounds[1])
+            finally:  # whatever happened here, their MjData are theirs until they are done
+                wait(pending)
             for future in pending:
                 future.result()
