@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sacformer_jax import CheckpointError, Config, resume, train
+from sacformer_jax import Config, resume, train
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.logging import read_records
 
@@ -49,16 +49,14 @@ def all_runs() -> dict[str, Config]:
 def run(config: Config) -> bool:
     """Starts, resumes or skips a run; whether it is done afterwards."""
     folder = RunFolder(config.run.run_dir)
-    done = folder.latest_step() if folder.path.exists() else None
+    done = folder.latest_step()
     if done is not None and done >= ENV_STEPS:
         return True
-    if done is None and folder.path.exists():
-        raise CheckpointError(f"{folder.path}: no checkpoint in it; remove it to start again")
     result = train(config) if done is None else resume(folder.path)
     return not result.interrupted
 
 
-def rows(name: str, config: Config) -> list[dict[str, Any]]:
+def rows(config: Config) -> list[dict[str, Any]]:
     """A run's evaluations as rows of the table."""
     folder = RunFolder(config.run.run_dir)
     seconds, total = {}, 0.0
@@ -89,10 +87,8 @@ def rows(name: str, config: Config) -> list[dict[str, Any]]:
 
 def write_table(configs: dict[str, Config]) -> None:
     """Writes the evaluations of all runs that have any; rows of other runs stay."""
-    present = {
-        name: c for name, c in configs.items() if RunFolder(c.run.run_dir).metrics_path.exists()
-    }
-    new = [row for name, config in present.items() for row in rows(name, config)]
+    started = [c for c in configs.values() if RunFolder(c.run.run_dir).metrics_path.exists()]
+    new = [row for config in started for row in rows(config)]
     replaced = {(row["env"], row["agent"], str(row["seed"])) for row in new}
     kept = []
     if TABLE.exists():
