@@ -46,7 +46,8 @@ class MetricLog:
       timings_path: the JSONL file of timings.
       tensorboard_dir: folder of TensorBoard events.
       keep_bytes: length to cut ``metrics.jsonl`` back to, when a run is resumed.
-      purge_after: environment steps after which TensorBoard events are dropped, on resume.
+      purge_after: environment steps after which timings and TensorBoard events are dropped, on
+        resume; None drops all of them, for a run that starts.
     """
 
     def __init__(
@@ -61,8 +62,9 @@ class MetricLog:
         self._metrics = metrics_path.open(mode)
         self._metrics.truncate(keep_bytes)
         self._metrics.seek(0, 2)
+        _cut_timings(timings_path, purge_after)
         self._timings = timings_path.open("ab")
-        purge_step = None if purge_after is None else purge_after + 1
+        purge_step = 0 if purge_after is None else purge_after + 1
         self._writer = SummaryWriter(str(tensorboard_dir), purge_step=purge_step)
 
     @property
@@ -97,6 +99,20 @@ class MetricLog:
         self._metrics.close()
         self._timings.close()
         self._writer.close()
+
+
+def _cut_timings(path: Path, keep_until: int | None) -> None:
+    """Drops the records after ``keep_until`` env steps (None: all), and a line cut short."""
+    if not path.exists():
+        return
+    kept: list[bytes] = []
+    for line in path.read_bytes().splitlines(keepends=True):
+        if keep_until is None or not line.endswith(b"\n"):
+            break
+        if json.loads(line)["env_steps"] > keep_until:
+            break
+        kept.append(line)
+    path.write_bytes(b"".join(kept))
 
 
 def read_records(path: Path, kind: str | None = None) -> list[Record]:

@@ -127,12 +127,21 @@ def test_a_new_log_empties_what_lay_there(tmp_path: Path) -> None:
     assert _lines(tmp_path / "metrics.jsonl") == [record]
 
 
-def test_timings_are_kept_on_resume(tmp_path: Path) -> None:
-    for env_steps in (1, 2):
-        log = _open(tmp_path)
+@pytest.mark.parametrize(("purge_after", "kept"), [(None, []), (1, [1]), (2, [1, 2])])
+def test_timings_are_cut_back_to_where_the_run_goes_on(
+    tmp_path: Path, purge_after: int | None, kept: list[int]
+) -> None:
+    path = tmp_path / "timings.jsonl"
+    log = _open(tmp_path)
+    for env_steps in (1, 2, 3):
         log.write_timing(env_steps, 0, {"chunk_seconds": 0.5})
-        log.close()
-    assert [line["env_steps"] for line in _lines(tmp_path / "timings.jsonl")] == [1, 2]
+    log.close()
+    path.write_bytes(path.read_bytes() + b'{"env_st')  # killed while writing
+
+    log = _open(tmp_path, purge_after=purge_after)
+    log.write_timing(9, 0, {"chunk_seconds": 0.5})
+    log.close()
+    assert [line["env_steps"] for line in _lines(path)] == [*kept, 9]
 
 
 def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
