@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from tensorboardX import SummaryWriter
 
@@ -58,12 +58,8 @@ class MetricLog:
         keep_bytes: int = 0,
         purge_after: int | None = None,
     ):
-        mode = "r+b" if metrics_path.exists() else "wb"
-        self._metrics = metrics_path.open(mode)
-        self._metrics.truncate(keep_bytes)
-        self._metrics.seek(0, 2)
-        _cut_timings(timings_path, purge_after)
-        self._timings = timings_path.open("ab")
+        self._metrics = _open_cut(metrics_path, keep_bytes)
+        self._timings = _open_cut(timings_path, _timing_bytes(timings_path, purge_after))
         purge_step = 0 if purge_after is None else purge_after + 1
         self._writer = SummaryWriter(str(tensorboard_dir), purge_step=purge_step)
 
@@ -101,18 +97,24 @@ class MetricLog:
         self._writer.close()
 
 
-def _cut_timings(path: Path, keep_until: int | None) -> None:
-    """Drops the records after ``keep_until`` env steps (None: all), and a line cut short."""
-    if not path.exists():
-        return
-    kept: list[bytes] = []
+def _open_cut(path: Path, keep_bytes: int) -> BinaryIO:
+    """Opens a file, new or not, to append after its first ``keep_bytes``."""
+    file = path.open("r+b" if path.exists() else "wb")
+    file.truncate(keep_bytes)
+    file.seek(0, 2)
+    return file
+
+
+def _timing_bytes(path: Path, keep_until: int | None) -> int:
+    """Length of the whole records up to ``keep_until`` env steps; None: no record."""
+    length = 0
+    if keep_until is None or not path.exists():
+        return length
     for line in path.read_bytes().splitlines(keepends=True):
-        if keep_until is None or not line.endswith(b"\n"):
+        if not line.endswith(b"\n") or json.loads(line)["env_steps"] > keep_until:
             break
-        if json.loads(line)["env_steps"] > keep_until:
-            break
-        kept.append(line)
-    path.write_bytes(b"".join(kept))
+        length += len(line)
+    return length
 
 
 def read_records(path: Path, kind: str | None = None) -> list[Record]:
