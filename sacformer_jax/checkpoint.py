@@ -14,7 +14,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ import orbax.checkpoint as ocp
 
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.config import Config
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.train import policy_state
 from sacformer_jax.types import Hyperparameters, PolicyState, TrainState
@@ -78,11 +78,6 @@ class Restored:
     state: TrainState
     progress: Progress
     host_threads: int
-
-
-def host_threads() -> int:
-    """CPU threads this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def digest(tree: Any) -> str:
@@ -204,7 +199,7 @@ class RunFolder:
             "progress": dataclasses.asdict(progress),
             "state_digest": digest(state),
             "policy_digest": digest(policy),
-            "host_threads": host_threads(),
+            "host_threads": usable_cores(),
         }
         with self._manager("checkpoints", KEEP) as manager:
             if progress.env_steps in manager.all_steps():

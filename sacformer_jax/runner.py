@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from sacformer_jax.checkpoint import Progress, RunFolder, host_threads
+from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs import VectorEnv
 from sacformer_jax.evaluate import Evaluation, make_evaluator
 from sacformer_jax.logging import MetricLog, Record, read_records
@@ -109,10 +110,10 @@ def resume(path: str | Path, total_env_steps: int | None = None, quiet: bool = F
         restored = folder.restore(jax.eval_shape(program.init, jax.random.key(config.seed)))
         reporter.facts(program, restored.state, folder.path)
         reporter.say(f"resuming at  {restored.progress.env_steps:,} env steps")
-        if restored.host_threads != host_threads():
+        if restored.host_threads != usable_cores():
             reporter.say(
                 f"note: saved with {restored.host_threads} CPU threads, continued with "
-                f"{host_threads()}: right, but not bit for bit the same"
+                f"{usable_cores()}: right, but not bit for bit the same"
             )
         return _Loop(program, folder, reporter, restored.progress).run(restored.state)
 

@@ -14,7 +14,6 @@ while JAX stays in float32. The measured position is carried because ``xpos`` an
 from __future__ import annotations
 
 import dataclasses
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
@@ -24,6 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, model_path
 from sacformer_jax.envs.tasks import Quantities, Task
 
@@ -164,7 +164,7 @@ class NativeEngine:
         self._derived = task.derived
         self._layout = _Layout({**shapes, "displacement": (2,), "bad": ()})
         self._num_state = mujoco.mj_stateSize(self.model, _STATE_SPEC) + 2
-        self.num_threads = num_threads or len(os.sched_getaffinity(0))
+        self.num_threads = num_threads or usable_cores()
         slices = self._layout.slices()
         self._workers = [_Worker(self.model, task, slices) for _ in range(self.num_threads)]
         self._pool = ThreadPoolExecutor(self.num_threads, thread_name_prefix="mujoco")
