@@ -1,0 +1,303 @@
+"""Studies: runs by name, trained a few at a time, and one table and picture of their evaluations.
+
+A study's script makes a :class:`Study` and returns its :meth:`Study.main`. Run NAME lies in
+runs/STUDY/NAME; a run that is done is skipped and one that was stopped is resumed, so a script can
+be stopped (Ctrl-C) and started again at will. Whenever a run ends, results/STUDY.csv and
+results/STUDY.png are written anew; rows of runs that were not asked for stay as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from sacformer_jax import Config, resume, train
+from sacformer_jax.checkpoint import CheckpointError, RunFolder
+from sacformer_jax.cli import EXIT_INTERRUPTED
+from sacformer_jax.logging import read_records
+from sacformer_jax.plots import comparison
+
+EXIT_FAILED = 1
+COLUMNS = (
+    "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
+    "return_std", "episodes", "wall_s", "commit",
+)  # fmt: skip
+_POLL_SECONDS = 0.2
+# What may differ between a run's folder and the study: where it lies and how far it goes.
+_NOT_COMPARED = {"run_dir", "total_env_steps"}
+
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass
+class _Worker:
+    """A process that trains one run."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    cores: list[int]
+    signals_sent: int = 0
+
+
+class Study:
+    """Runs that are compared with each other.
+
+    Args:
+      name: of the study.
+      configs: every run's name and configuration; ``run_dir`` is set here.
+      script: the file that makes the study; it is started again as the worker of each run.
+      runs: where run folders lie; default ``runs/NAME`` below the working directory.
+      results: where table and picture go; default ``results`` beside the script.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        configs: dict[str, Config],
+        script: str | Path,
+        runs: Path | None = None,
+        results: Path | None = None,
+    ):
+        self.name, self.script = name, Path(script).resolve()
+        self.runs = runs or Path("runs") / name
+        self.configs = {
+            run: config.replace(run_dir=str(self.runs / run)) for run, config in configs.items()
+        }
+        results = results or self.script.parent / "results"
+        self.table, self.picture = results / f"{name}.csv", results / f"{name}.png"
+
+    def main(self, arguments: Sequence[str] | None = None) -> int:
+        """The command line; 0 when all is done, 3 when stopped by a signal, 1 if a run failed."""
+        parser = argparse.ArgumentParser(description=f"Runs of the study {self.name!r}.")
+        parser.add_argument(
+            "--only", nargs="+", choices=list(self.configs), metavar="RUN", help="some of the runs"
+        )
+        parser.add_argument(
+            "--jobs", type=int, default=1, help="runs side by side, each on its share of the cores"
+        )
+        parser.add_argument("--list", action="store_true", help="print the runs and stop")
+        parser.add_argument("--worker", choices=list(self.configs), help=argparse.SUPPRESS)
+        parser.add_argument("--cores", type=int, nargs="*", help=argparse.SUPPRESS)
+        args = parser.parse_args(arguments)
+        if args.worker:
+            return self._work(args.worker, args.cores)
+        names = args.only or list(self.configs)
+        if args.list:
+            print("\n".join(names))
+            return 0
+        cores = _cores()
+        if not 1 <= args.jobs <= max(1, len(cores)):
+            parser.error(f"--jobs {args.jobs}: must be from 1 to {max(1, len(cores))}, the cores")
+        for name in names:
+            try:
+                changed = self._changed(name)
+            except CheckpointError as error:
+                parser.error(str(error))
+            if changed:
+                parser.error(
+                    f"{self.runs / name} was trained with other settings ({', '.join(changed)}): "
+                    "move it away to train anew"
+                )
+        shares = [cores[i :: args.jobs] for i in range(args.jobs)] if args.jobs > 1 else [[]]
+        code = self._train(names, shares)
+        self.write(names)
+        print(self.summary(names))
+        return code
+
+    # --- running -----------------------------------------------------------------------------
+
+    def _done(self, name: str) -> bool:
+        config = self.configs[name]
+        return (self._folder(name).latest_step() or 0) >= config.run.total_env_steps
+
+    def _folder(self, name: str) -> RunFolder:
+        return RunFolder(self.configs[name].run.run_dir)
+
+    def _changed(self, name: str) -> list[str]:
+        """Fields in which an existing run differs from what the study asks for now."""
+        folder = self._folder(name)
+        if folder.latest_step() is None:
+            return []
+        now, then = self.configs[name].flat(), folder.read_config().config.flat()
+        return [field for field in now if field not in _NOT_COMPARED and now[field] != then[field]]
+
+    def _train(self, names: list[str], shares: list[list[int]]) -> int:
+        """Keeps one worker on each share of the cores; signals are passed on to the workers."""
+        waiting, free = deque(n for n in names if not self._done(n)), deque(shares)
+        working: list[_Worker] = []
+        failed: list[str] = []
+        asked: list[int] = []
+        previous = {
+            number: signal.signal(number, lambda got, _: asked.append(got))
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        try:
+            while working or (waiting and not asked):
+                while waiting and free and not asked:
+                    working.append(self._start(waiting.popleft(), free.popleft()))
+                for worker in working:
+                    while worker.signals_sent < len(asked):
+                        worker.process.send_signal(asked[worker.signals_sent])
+                        worker.signals_sent += 1
+                ended = [w for w in working if w.process.poll() is not None]
+                for worker in ended:
+                    working.remove(worker)
+                    free.append(worker.cores)
+                    code = worker.process.returncode
+                    print(f"{worker.name}: {'done' if code == 0 else f'ended with code {code}'}")
+                    if code != 0 and not asked:
+                        failed.append(worker.name)
+                    self.write([worker.name])
+                if not ended:
+                    time.sleep(_POLL_SECONDS)
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+        if asked:
+            return EXIT_INTERRUPTED
+        if failed:
+            print(f"failed: {', '.join(failed)}", file=sys.stderr)
+            return EXIT_FAILED
+        return 0
+
+    def _start(self, name: str, cores: list[int]) -> _Worker:
+        """Starts a run's worker: on the terminal, or with a log where several run side by side."""
+        command = [sys.executable, str(self.script), "--worker", name, "--cores"]
+        command += [str(core) for core in cores]
+        log = self.runs / f"{name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as file:
+            output = file if cores else None
+            # A session of its own: the terminal's Ctrl-C reaches only us, who pass it on once.
+            process = subprocess.Popen(
+                command, start_new_session=True, stdout=output, stderr=output
+            )
+        print(f"{name}: started" + (f" on cores {cores}, log in {log}" if cores else ""))
+        return _Worker(name, process, cores)
+
+    def _work(self, name: str, cores: list[int]) -> int:
+        if cores:
+            os.sched_setaffinity(0, cores)  # before JAX makes its threads
+        config, folder = self.configs[name], self._folder(name)
+        self._note_commit(name)
+        if folder.latest_step() is None:
+            result = train(config)
+        else:
+            result = resume(folder.path, total_env_steps=config.run.total_env_steps)
+        return EXIT_INTERRUPTED if result.interrupted else 0
+
+    # --- results -----------------------------------------------------------------------------
+
+    def _commits_path(self, name: str) -> Path:
+        return self.runs / f"{name}.commits"
+
+    def _note_commit(self, name: str) -> None:
+        """Keeps by which versions of the code a run was trained."""
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--exclude=*"],
+            cwd=self.script.parent, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        commit = described.stdout.strip() or "unknown"
+        path = self._commits_path(name)
+        commits = path.read_text().split() if path.exists() else []
+        if self._folder(name).latest_step() is None:
+            commits = []
+        if commit not in commits:
+            path.write_text("\n".join([*commits, commit]) + "\n")
+
+    def rows(self, name: str) -> list[Row]:
+        """A run's evaluations as rows of the table; none if it has not begun."""
+        config, folder = self.configs[name], self._folder(name)
+        if not folder.metrics_path.exists():
+            return []
+        seconds, total = {}, 0.0
+        for record in read_records(folder.timings_path):
+            total += record["chunk_seconds"]
+            seconds[record["env_steps"]] = total
+        path = self._commits_path(name)
+        return [
+            {
+                "study": self.name,
+                "run": name,
+                "agent": config.agent,
+                "preset": config.preset,
+                "env": config.task.env,
+                "engine": folder.read_spec().engine,
+                "seed": config.seed,
+                "env_steps": record["env_steps"],
+                "return_mean": round(record["return_mean"], 2),
+                "return_std": round(record["return_std"], 2),
+                "episodes": record["episodes"],
+                "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
+                "commit": "+".join(path.read_text().split()) if path.exists() else "unknown",
+            }
+            for record in read_records(folder.metrics_path, "eval")
+        ]
+
+    def read_table(self) -> list[Row]:
+        """The table as it is on disk."""
+        if not self.table.exists():
+            return []
+        with self.table.open(newline="") as file:
+            return [
+                {
+                    **row,
+                    "env_steps": int(row["env_steps"]),
+                    "return_mean": float(row["return_mean"]),
+                }
+                for row in csv.DictReader(file)
+            ]
+
+    def write(self, names: Iterable[str]) -> None:
+        """Puts the rows of these runs into the table and draws it; other runs' rows stay."""
+        new = {name: rows for name in names if (rows := self.rows(name))}
+        kept = [row for row in self.read_table() if row["run"] not in new]
+        order = {name: place for place, name in enumerate(self.configs)}
+        rows = [*kept, *(row for rows in new.values() for row in rows)]
+        rows.sort(key=lambda row: (order.get(row["run"], len(order)), row["env_steps"]))
+        if not rows:
+            return
+        self.table.parent.mkdir(parents=True, exist_ok=True)
+        part = self.table.with_suffix(".part")
+        with part.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(rows)
+        part.replace(self.table)
+        comparison(rows, self.picture, f"{self.name}: evaluation return")
+
+    def summary(self, names: Iterable[str]) -> str:
+        """A Markdown table: return at the end, mean of the last five evaluations, best, seconds."""
+        wanted = set(names)
+        lines = [
+            "| run | env steps | at the end | last five | best | training, s |",
+            "| --- | --- | --- | --- | --- | --- |",
+        ]
+        by_run: dict[str, list[Row]] = {}
+        for row in self.read_table():
+            by_run.setdefault(row["run"], []).append(row)
+        for name, rows in by_run.items():
+            if name in wanted:
+                returns = [row["return_mean"] for row in rows]
+                last = returns[-5:]
+                lines.append(
+                    f"| {name} | {rows[-1]['env_steps']:,} | {returns[-1]:.0f} "
+                    f"| {sum(last) / len(last):.0f} | {max(returns):.0f} "
+                    f"| {float(rows[-1]['wall_s']):,.0f} |"
+                )
+        return "\n".join(lines)
+
+
+def _cores() -> list[int]:
+    """The cores this process may use; none where processes cannot be bound to them."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
