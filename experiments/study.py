@@ -270,7 +270,7 @@ class Study:
         self.table.parent.mkdir(parents=True, exist_ok=True)
         part = self.table.with_suffix(".part")
         with part.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
         part.replace(self.table)

@@ -27,9 +27,11 @@ from sacformer_jax import (
     load_policy,
     make_program,
     resume,
+    runner,
     train,
 )
 from sacformer_jax.checkpoint import RunFolder, digest
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.logging import read_records
 from sacformer_jax.types import Context
 
@@ -62,15 +64,20 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     return Outcome(result, printed.getvalue())
 
 
+def _killed(straight: Outcome, path: Path) -> Path:
+    """A copy of the run without its last checkpoint, as if killed before it was written."""
+    shutil.copytree(straight.result.path, path)
+    shutil.rmtree(path / "checkpoints" / str(TOTAL))
+    return path
+
+
 @pytest.fixture(scope="module")
 def resumed(straight: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """The same run killed after its checkpoint at ``STOP`` (but before the next) and resumed.
 
     What it had written since then is still there, the last line only in part.
     """
-    path = tmp_path_factory.mktemp("runs") / "resumed"
-    shutil.copytree(straight.result.path, path)
-    shutil.rmtree(path / "checkpoints" / str(TOTAL))
+    path = _killed(straight, tmp_path_factory.mktemp("runs") / "resumed")
     (path / "learning_curve.png").unlink()
     metrics = path / "metrics.jsonl"
     metrics.write_bytes(metrics.read_bytes() + b'{"kind": "eval", "env_steps": 800}\n{"kind": "tr')
@@ -118,6 +125,19 @@ def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed
     assert resumed.result.evaluations == straight.result.evaluations
     assert not resumed.result.interrupted
     assert (resumed.result.path / "learning_curve.png").is_file()
+
+
+def test_resuming_on_other_cores_says_that_it_is_not_exact(
+    straight: Outcome, resumed: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    here = usable_cores()
+    monkeypatch.setattr(runner, "usable_cores", lambda: here + 1)
+    monkeypatch.setattr(runner._Loop, "run", lambda *_: resumed.result)
+    resume(_killed(straight, tmp_path / "run"))
+    note = f"note: saved with {here} CPU threads, continued with {here + 1}"
+    assert note in " ".join(capsys.readouterr().out.split())
+    assert "note: saved with" not in resumed.printed
 
 
 def test_a_finished_run_is_not_resumed(straight: Outcome) -> None:
