@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.native import loading_quietly
 from sacformer_jax.policy import Policy
 
 
@@ -57,9 +59,9 @@ def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEv
 
 def evaluate_random(env_id: str, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
     """The same with uniformly random actions."""
-    env = gymnasium.make(env_id)
-    env.action_space.seed(seed)
-    space = env.action_space
+    with loading_quietly(), contextlib.closing(gymnasium.make(env_id)) as env:
+        space = env.action_space
+    space.seed(seed)
     return _run(env_id, episodes, seed, lambda: None, lambda obs, reward: space.sample())
 
 
@@ -85,7 +87,8 @@ def _run(
 ) -> GymnasiumEvaluation:
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
-    env = gymnasium.make(env_id)
+    with loading_quietly():
+        env = gymnasium.make(env_id)
     returns, lengths = np.zeros(episodes), np.zeros(episodes, int)
     terms: dict[str, float] = {}
     for episode in range(episodes):

@@ -13,8 +13,10 @@ while JAX stays in float32. The measured position is carried because ``xpos`` an
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
@@ -131,16 +133,23 @@ class _Worker:
         out[self.num_physics :] = self.measure()
 
 
-def _load_model(task: Task) -> mujoco.MjModel:
-    """Compiles the task's model without the warnings about its old attributes.
+@contextlib.contextmanager
+def loading_quietly() -> Iterator[None]:
+    """Around the loading of Gymnasium's models: drops the warnings about their old attributes.
 
     MuJoCo's own handler would print them and write MUJOCO_LOG.TXT into the working directory.
     """
+    handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
-        return mujoco.MjModel.from_xml_path(str(model_path(task)))
+        yield
     finally:
-        mujoco.set_mju_user_warning(None)
+        mujoco.set_mju_user_warning(handler)
+
+
+def _load_model(task: Task) -> mujoco.MjModel:
+    with loading_quietly():
+        return mujoco.MjModel.from_xml_path(str(model_path(task)))
 
 
 class NativeEngine:
