@@ -114,7 +114,9 @@ class Reporter:
         )
 
     def table(self, evaluations: list[Record]) -> None:
-        """Prints the evaluations as a table (at most the last 15)."""
+        """Prints the evaluations as a table (at most the last 15), below the bar."""
+        if not self._bar.disable:
+            self._bar.stop()
         table = Table(title="evaluations, mean action")
         for column in ("env steps", "return", "std", "length", "episodes"):
             table.add_column(column, justify="right")
