@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import itertools
 import sys
+from typing import Any
 
 from study import Study
 
 from sacformer_jax import Config
 
 ENV_STEPS = 60_000
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "64-windows": {"batch_size": 64},
     "single-steps": {"context_length": 1, "batch_size": 192},
     "no-return": {"return_conditioning": "none"},

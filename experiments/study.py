@@ -54,7 +54,8 @@ class Study:
 
     Args:
       name: of the study.
-      configs: every run's name and configuration; ``run_dir`` is set here.
+      configs: every run's name, ``[TASK-]VARIANT-SEED``, and configuration; ``run_dir`` is set
+        here.
       script: the file that makes the study; it is started again as the worker of each run.
       runs: where run folders lie; default ``runs/NAME`` below the working directory.
       results: where table and picture go; default ``results`` beside the script.
@@ -274,7 +275,8 @@ class Study:
             writer.writeheader()
             writer.writerows(rows)
         part.replace(self.table)
-        comparison(rows, self.picture, f"{self.name}: evaluation return")
+        lines = [{**row, "variant": _variant(row)} for row in rows]
+        comparison(lines, self.picture, f"{self.name}: evaluation return")
 
     def summary(self, names: Iterable[str]) -> str:
         """A Markdown table: return at the end, mean of the last five evaluations, best, seconds."""
@@ -296,6 +298,11 @@ class Study:
                     f"| {float(rows[-1]['wall_s']):,.0f} |"
                 )
         return "\n".join(lines)
+
+
+def _variant(row: Row) -> str:
+    """What a run stands for: its name without task and seed."""
+    return str(row["run"]).removeprefix(f"{row['env']}-").removesuffix(f"-{row['seed']}")
 
 
 def _cores() -> list[int]:

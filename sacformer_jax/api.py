@@ -8,9 +8,9 @@ from typing import Any
 import jax
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs import VectorEnv, make_env
 from sacformer_jax.evaluate import make_evaluator
 from sacformer_jax.policy import load_policy
+from sacformer_jax.train import make_training_env
 
 
 def evaluate(
@@ -47,11 +47,8 @@ def evaluate(
     loaded = load_policy(run, policy)
     if gymnasium:
         return evaluate_policy(loaded, episodes, seed).record()
-    task = loaded.config.task
-    env = VectorEnv(
-        make_env(task.env, task.engine, task.brax_backend), episodes, task.max_episode_steps
-    )
+    env = make_training_env(loaded.config, num_envs=episodes)
     evaluator = make_evaluator(env, loaded.agent, loaded.config.context.context_length)
     record = summarize(evaluator(loaded.state, jax.random.key(seed)))
     names = ("episodes", "return_mean", "return_std", "length_mean")
-    return {"env": task.env, **{name: record[name] for name in names}}
+    return {"env": loaded.config.task.env, **{name: record[name] for name in names}}

@@ -17,7 +17,9 @@ from typing import Any, Literal
 AgentName = Literal["sacformer", "sac"]
 PresetName = Literal["cpu", "paper"]
 Conditioning = Literal["hindsight", "commanded", "none"]
-EngineName = Literal["auto", "native"]
+EngineName = Literal["auto", "native", "mjx"]
+MjxPreset = Literal["parity", "fast"]
+MjxImpl = Literal["jax", "warp"]
 BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
@@ -33,7 +35,11 @@ class TaskConfig:
     env: str = "HalfCheetah"
     """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, or brax:NAME."""
     engine: EngineName = "auto"
-    """Physics engine of the MuJoCo tasks."""
+    """Physics engine of the MuJoCo tasks: C MuJoCo (native), MuJoCo in JAX (mjx), or by device."""
+    mjx_preset: MjxPreset = "parity"
+    """Solver of engine mjx: as in Gymnasium's models (parity), or few iterations (fast)."""
+    mjx_impl: MjxImpl = "jax"
+    """Implementation of engine mjx; warp needs an NVIDIA GPU and the package warp-lang."""
     brax_backend: BraxBackend = "spring"
     """Physics backend of brax:NAME tasks."""
     num_envs: int = 1

@@ -54,19 +54,20 @@ def comparison(rows: list[Record], path: Path, title: str) -> None:
     Thin lines are single seeds, the thick line is their mean where all were evaluated.
 
     Args:
-      rows: evaluations, each with ``env``, ``agent``, ``seed``, ``env_steps`` and ``return_mean``.
+      rows: evaluations, each with ``env``, ``variant`` (a line each), ``seed``, ``env_steps`` and
+        ``return_mean``.
       path: file to write.
       title: above the panels.
     """
     envs = list(dict.fromkeys(row["env"] for row in rows))
-    agents = list(dict.fromkeys(row["agent"] for row in rows))
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
     figure = Figure(figsize=(4 * len(envs), 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
-        for place, agent in enumerate(agents):
+        for place, variant in enumerate(variants):
             curves: dict[str, dict[int, float]] = {}
             for row in rows:
-                if (row["env"], row["agent"]) == (env, agent):
+                if (row["env"], row["variant"]) == (env, variant):
                     seed = curves.setdefault(str(row["seed"]), {})
                     seed[row["env_steps"]] = row["return_mean"]
             for curve in curves.values():
@@ -75,7 +76,7 @@ def comparison(rows: list[Record], path: Path, title: str) -> None:
                 common = sorted(set.intersection(*(set(curve) for curve in curves.values())))
                 means = [sum(c[step] for c in curves.values()) / len(curves) for step in common]
                 seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
-                axes.plot(common, means, color=f"C{place}", lw=2, label=f"{agent}, {seeds}")
+                axes.plot(common, means, color=f"C{place}", lw=2, label=f"{variant}, {seeds}")
         axes.set(xlabel="environment steps", title=env)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)

@@ -53,11 +53,11 @@ class Program:
     train_chunk: jax.stages.Wrapped
 
 
-def make_training_env(config: Config) -> VectorEnv:
-    """The configuration's environment, vectorized."""
+def make_training_env(config: Config, num_envs: int | None = None) -> VectorEnv:
+    """The configuration's environment, vectorized; ``num_envs`` other than its own if given."""
     task = config.task
-    env = make_env(task.env, task.engine, task.brax_backend)
-    return VectorEnv(env, task.num_envs, task.max_episode_steps)
+    env = make_env(task.env, task.engine, task.brax_backend, task.mjx_preset, task.mjx_impl)
+    return VectorEnv(env, task.num_envs if num_envs is None else num_envs, task.max_episode_steps)
 
 
 def make_program(config: Config, env: VectorEnv | None = None) -> Program:

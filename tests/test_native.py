@@ -18,7 +18,7 @@ import pytest
 from sacformer_jax.envs import native
 from sacformer_jax.envs.mujoco_env import MujocoEnv
 from sacformer_jax.envs.native import NativeEngine
-from sacformer_jax.envs.physics import ResetNoise
+from sacformer_jax.envs.physics import EngineChoice, ResetNoise
 from sacformer_jax.envs.tasks import TASKS
 
 NUM_STEPS = 1000
@@ -33,7 +33,7 @@ FALLING = ("Hopper", "Walker2d", "Humanoid")
 
 @functools.cache
 def make(name: str) -> MujocoEnv:
-    return MujocoEnv(name, "native")
+    return MujocoEnv(name, EngineChoice("native"))
 
 
 def physics_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -356,7 +356,7 @@ def test_step_and_reset_equals_step_and_reset_apart(name):
     words = jax.vmap(engine.reset)(noise).state
     ctrl, reset = random_actions(engine, 4), jnp.array([True, False, True, False])
     before = engine.host_calls
-    both = jax.vmap(engine.step_and_reset)(words, ctrl, reset, fresh_noise)
+    both = engine.step_and_reset(words, ctrl, reset, fresh_noise)
     stepped, fresh = jax.block_until_ready(both)
     assert engine.host_calls - before == 1
     assert_trees_equal(stepped, jax.vmap(engine.step)(words, ctrl))
@@ -411,10 +411,10 @@ _MANY_CALLS = """
 import sys
 import jax, jax.numpy as jnp
 from sacformer_jax.envs.core import VectorEnv
-from sacformer_jax.envs.mujoco_env import MujocoEnv
+from sacformer_jax.envs import make_env
 
 chunks, chunk = int(sys.argv[1]), 1000
-env = VectorEnv(MujocoEnv("Hopper", "native"), 2)
+env = VectorEnv(make_env("Hopper", "native"), 2)
 weights = jax.random.normal(jax.random.key(5), (256, 256)) / 16
 
 @jax.jit

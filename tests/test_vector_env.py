@@ -340,7 +340,7 @@ def resets(request):
         # forces and velocities in the engine's MjData would show.
         sunk = few.replace(qpos=few.qpos.at[:, height].add(-0.7))
         action = jnp.ones((3, env.spec.action_size))
-        stepped, fresh = jax.vmap(engine.step_and_reset)(
+        stepped, fresh = engine.step_and_reset(
             jax.vmap(engine.reset)(sunk).state, action, jnp.ones(3, bool), few
         )
         obs = jax.vmap(env.task.observe)(fresh.quantities)

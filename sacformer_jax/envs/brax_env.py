@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from typing import Any, get_args
 
 import jax
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 from sacformer_jax.config import BraxBackend, ConfigError
 from sacformer_jax.envs.core import EnvSpec, EnvStep, JaxEnv
 
-with contextlib.redirect_stdout(sys.stderr):  # brax says on stdout which extras it misses
+with contextlib.redirect_stdout(None):  # brax prints which extras it could do without
     from brax import envs as brax_envs
 
 BACKENDS = get_args(BraxBackend)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
-from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, make_engine, resolve_engine
+from sacformer_jax.envs.physics import EngineChoice, PhysicsOutput, ResetNoise, make_engine
 from sacformer_jax.envs.tasks import TASKS
 
 
@@ -17,17 +17,17 @@ class MujocoEnv:
 
     Args:
       name: the task's name, e.g. ``"HalfCheetah"``.
-      engine: one of :data:`~sacformer_jax.envs.physics.ENGINES`.
+      choice: the physics engine.
 
     Raises:
       KeyError: no such task.
-      ValueError: no such engine.
+      ConfigError: this machine or this task cannot have the engine.
     """
 
-    def __init__(self, name: str, engine: str = "auto"):
+    def __init__(self, name: str, choice: EngineChoice):
         self.task = task = TASKS[name]
-        engine_name, reason = resolve_engine(engine)
-        self.engine = make_engine(task, engine_name)
+        choice, reason = choice.resolved()
+        self.engine = make_engine(task, choice)
         obs_size = jax.eval_shape(self.reset, jax.random.key(0))[1].shape[0]
         self.spec = EnvSpec(
             name=name,
@@ -36,7 +36,7 @@ class MujocoEnv:
             action_low=tuple(self.engine.action_low.tolist()),
             action_high=tuple(self.engine.action_high.tolist()),
             max_episode_steps=task.max_episode_steps,
-            engine=engine_name,
+            engine=choice.engine,
             engine_reason=reason,
             gymnasium_id=task.gymnasium_id,
         )
@@ -57,7 +57,7 @@ class MujocoEnv:
         prepared: tuple[Any, jax.Array],
         keys: jax.Array,
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
-        stepped, fresh = jax.vmap(self.engine.step_and_reset)(
+        stepped, fresh = self.engine.step_and_reset(
             states, actions, refill, jax.vmap(self.reset_noise)(keys)
         )
         fresh_obs = jax.vmap(self.task.observe)(fresh.quantities)

@@ -147,7 +147,7 @@ def loading_quietly() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _load_model(task: Task) -> mujoco.MjModel:
+def load_model(task: Task) -> mujoco.MjModel:
     with loading_quietly():
         return mujoco.MjModel.from_xml_path(str(model_path(task)))
 
@@ -161,7 +161,7 @@ class NativeEngine:
     """
 
     def __init__(self, task: Task, num_threads: int | None = None):
-        self.model = _load_model(task)
+        self.model = load_model(task)
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
         self.dt = float(self.model.opt.timestep * task.frame_skip)
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
@@ -190,6 +190,11 @@ class NativeEngine:
         return self._unpack(*self._call(self._host_step, 1, state, ctrl))
 
     def step_and_reset(
+        self, states: jax.Array, ctrls: jax.Array, reset: jax.Array, noise: ResetNoise
+    ) -> tuple[PhysicsOutput, PhysicsOutput]:
+        return jax.vmap(self._step_and_reset)(states, ctrls, reset, noise)
+
+    def _step_and_reset(
         self, state: jax.Array, ctrl: jax.Array, reset: jax.Array, noise: ResetNoise
     ) -> tuple[PhysicsOutput, PhysicsOutput]:
         words, row, fresh_words, fresh_row = self._call(

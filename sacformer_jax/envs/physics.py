@@ -7,17 +7,20 @@ those into observations and rewards.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import flax.struct
 import jax
 
-from sacformer_jax.config import ConfigError
+from sacformer_jax.config import ConfigError, EngineName, MjxImpl, MjxPreset
 from sacformer_jax.envs.tasks import Quantities, Task
 
-ENGINES = ("auto", "native")
+ENGINES = get_args(EngineName)
+MJX_PRESETS = get_args(MjxPreset)
+MJX_IMPLS = get_args(MjxImpl)
 
 
 @flax.struct.dataclass
@@ -44,7 +47,7 @@ class PhysicsOutput:
 
 
 class Engine(Protocol):
-    """What every physics engine provides (shapes of one environment; vmap for more)."""
+    """What every physics engine provides; ``reset`` and ``step`` are of one environment."""
 
     nq: int
     nv: int
@@ -62,9 +65,9 @@ class Engine(Protocol):
         ...
 
     def step_and_reset(
-        self, state: Any, ctrl: jax.Array, reset: jax.Array, noise: ResetNoise
+        self, states: Any, ctrls: jax.Array, reset: jax.Array, noise: ResetNoise
     ) -> tuple[PhysicsOutput, PhysicsOutput]:
-        """Both at once; where ``reset`` (bool) is false the second output holds zeros."""
+        """Both at once for N environments; where ``reset [N]`` is false the second holds zeros."""
         ...
 
 
@@ -81,22 +84,58 @@ def model_path(task: Task) -> Path:
     return path
 
 
-def resolve_engine(engine: str) -> tuple[str, str]:
-    """The engine that ``engine`` stands for, and why: ``("native", "CPU backend")``.
+@dataclasses.dataclass(frozen=True)
+class EngineChoice:
+    """Which engine runs a task, and how.
+
+    Attributes:
+      engine: one of :data:`ENGINES`.
+      mjx_preset: solver settings of ``mjx``: one of :data:`MJX_PRESETS`.
+      mjx_impl: implementation of ``mjx``: one of :data:`MJX_IMPLS`.
 
     Raises:
-      ConfigError: ``engine`` is not one of :data:`ENGINES`.
+      ConfigError: a value is not among those.
     """
-    if engine not in ENGINES:
-        raise ConfigError(f"engine={engine!r}: must be one of {', '.join(ENGINES)}")
-    if engine == "auto":
-        return "native", f"auto: C MuJoCo on the host, JAX backend is {jax.default_backend()}"
-    return engine, "as asked for"
+
+    engine: str = "auto"
+    mjx_preset: str = "parity"
+    mjx_impl: str = "jax"
+
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("engine", ENGINES),
+            ("mjx_preset", MJX_PRESETS),
+            ("mjx_impl", MJX_IMPLS),
+        ):
+            value = getattr(self, name)
+            if value not in choices:
+                raise ConfigError(f"{name}={value!r}: must be one of {', '.join(choices)}")
+
+    def resolved(self) -> tuple[EngineChoice, str]:
+        """Itself with ``auto`` decided by the device, and why."""
+        chosen, reason = self, "as asked for"
+        if self.engine == "auto":
+            backend = jax.default_backend()
+            engine, where = ("native", "C MuJoCo on the host") if backend == "cpu" else (
+                "mjx", "MuJoCo on the device"
+            )  # fmt: skip
+            chosen = dataclasses.replace(self, engine=engine)
+            reason = f"auto: {where}, JAX backend is {backend}"
+        if chosen.engine == "mjx":
+            reason += f"; preset {chosen.mjx_preset}, impl {chosen.mjx_impl}"
+        return chosen, reason
 
 
-def make_engine(task: Task, engine: str = "auto") -> Engine:
-    """Builds the engine for ``task``."""
+def make_engine(task: Task, choice: EngineChoice) -> Engine:
+    """Builds the engine for ``task``; ``choice`` must be resolved.
+
+    Raises:
+      ConfigError: this machine or this task cannot have it.
+    """
+    if choice.engine == "mjx":
+        from sacformer_jax.envs.mjx_engine import MjxEngine
+
+        return MjxEngine(task, choice.mjx_preset, choice.mjx_impl)
     from sacformer_jax.envs.native import NativeEngine
 
-    resolve_engine(engine)
     return NativeEngine(task)
