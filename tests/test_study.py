@@ -202,3 +202,9 @@ def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
     said, _ = changed.communicate()
     assert changed.returncode == 2
     assert "run-0 was trained with other settings (critic_width)" in said
+
+
+def test_a_runs_name_without_task_and_seed_is_its_variant() -> None:
+    row = {"env": "Hopper", "seed": "1"}
+    names = {"Hopper-sac-1": "sac", "64-windows-1": "64-windows", "Ant-sac-1": "Ant-sac"}
+    assert {name: studies._variant({**row, "run": name}) for name in names} == names
