@@ -21,6 +21,7 @@ EngineName = Literal["auto", "native", "mjx"]
 MjxPreset = Literal["parity", "fast"]
 MjxImpl = Literal["jax", "warp"]
 BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
+CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
 
@@ -122,14 +123,18 @@ class ActorConfig:
 class CriticConfig:
     """The twin critics."""
 
+    critic: CriticName = "mlp"
+    """Sees the state and the action alone (mlp), or the window before them too (transformer)."""
     critic_layers: int = 2
-    """Hidden layers."""
+    """Hidden layers (mlp) or transformer blocks (transformer)."""
     critic_width: int = 256
-    """Width of the hidden layers."""
+    """Width of hidden layers (mlp) or tokens (transformer)."""
+    critic_heads: int = 1
+    """Attention heads (transformer)."""
     critic_activation: Activation = "relu"
     """Activation function."""
     critic_layer_norm: bool = False
-    """LayerNorm before each activation."""
+    """LayerNorm before each activation (mlp)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Actors and critics. Letters: B windows, T states of a window, O, A, D width."""
+"""Actors. Letters: B windows, T states of a window, O, A, D width."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.transformer import (
     ACTIVATIONS,
     LAYER_NORM_EPSILON,
@@ -18,6 +19,11 @@ from sacformer_jax.transformer import (
 )
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+def max_time_step(spec: EnvSpec) -> int:
+    """How many time steps there are: the state after an episode's last step has one too."""
+    return spec.max_episode_steps + 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +113,8 @@ class TransformerActor(nn.Module):
         pair_mask = banded_causal_mask(state_mask, self.context_length)
         token_mask = jnp.repeat(jnp.repeat(pair_mask, 2, axis=1), 2, axis=2)  # [B, 2T, 2T]
         token_mask &= jnp.tril(jnp.ones((2 * states, 2 * states), bool))
-        # State tokens are the odd ones.
-        features = Transformer(self.config, every_second=True, name="trunk")(
+        # State tokens are the second ones.
+        features = Transformer(self.config, group=2, name="trunk")(
             tokens, token_mask, deterministic
         )
         return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
@@ -151,31 +157,3 @@ class MLPActor(nn.Module):
         del return_to_go, time_step, state_mask, deterministic
         features = MLP(self.widths, self.activation, name="mlp")(obs)
         return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
-
-
-class Critic(nn.Module):
-    """Q(s, a): an MLP on the concatenation."""
-
-    widths: Sequence[int]
-    activation: str
-    layer_norm: bool
-
-    @nn.compact
-    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
-        """``obs [..., O]``, ``action [..., A]`` -> ``[...]``."""
-        x = jnp.concatenate([obs, action], axis=-1)
-        x = MLP(self.widths, self.activation, self.layer_norm, name="mlp")(x)
-        return nn.Dense(1, kernel_init=nn.initializers.lecun_uniform(), name="q")(x)[..., 0]
-
-
-def twin_critic(widths: Sequence[int], activation: str, layer_norm: bool) -> nn.Module:
-    """Two independent critics; the output leads with their axis: ``[2, ...]``."""
-    twin = nn.vmap(
-        Critic,
-        variable_axes={"params": 0},
-        split_rngs={"params": True},
-        in_axes=None,
-        out_axes=0,
-        axis_size=2,
-    )
-    return twin(tuple(widths), activation, layer_norm)

@@ -56,11 +56,12 @@ class Block(nn.Module):
 
     Attributes:
       config: the trunk's.
-      every_second: compute only the tokens at odd places; all are still attended to.
+      group: tokens come in groups of this size, and only the last of each is computed; all are
+        still attended to.
     """
 
     config: TransformerConfig
-    every_second: bool = False
+    group: int = 1
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool) -> jax.Array:
@@ -72,8 +73,9 @@ class Block(nn.Module):
         dropout = Dropout(cfg.dropout, name="dropout")
 
         normed = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_1")(x)
-        if self.every_second:
-            x, queries, mask = x[:, 1::2], normed[:, 1::2], mask[:, 1::2]
+        if self.group > 1:
+            last = slice(self.group - 1, None, self.group)
+            x, queries, mask = x[:, last], normed[:, last], mask[:, last]
             q = nn.Dense(width, kernel_init=projection, name="query")(queries)
             kv = nn.Dense(2 * width, kernel_init=projection, name="key_value")(normed)
             k, v = jnp.split(kv, 2, axis=-1)
@@ -104,11 +106,12 @@ class Transformer(nn.Module):
 
     Attributes:
       config: sizes.
-      every_second: return only the tokens at odd places; the last block then computes only those.
+      group: tokens come in groups of this size, and only the last of each is returned; the last
+        block then computes only those.
     """
 
     config: TransformerConfig
-    every_second: bool = False
+    group: int = 1
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool = True) -> jax.Array:
@@ -121,12 +124,12 @@ class Transformer(nn.Module):
           deterministic: dropout off.
 
         Returns:
-          ``[B, T, D]``, or ``[B, T/2, D]`` with ``every_second``.
+          ``[B, T/group, D]``.
         """
         x = Dropout(self.config.dropout, name="dropout")(x, deterministic)
         for i in range(self.config.layers):
             last = i == self.config.layers - 1
-            block = Block(self.config, self.every_second and last, name=f"block_{i}")
+            block = Block(self.config, self.group if last else 1, name=f"block_{i}")
             x = block(x, mask, deterministic)
         return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_f")(x)
 

@@ -10,7 +10,7 @@ _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width",
+    "critic_width", "critic_heads",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
@@ -45,6 +45,7 @@ def check(config: Config) -> None:
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
     _check_actor(config)
+    _check_critic(config)
     _check_steps(config)
 
 
@@ -70,6 +71,24 @@ def _check_actor(config: Config) -> None:
             actor.actor_width % actor.actor_heads == 0,
             f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",
         )
+
+
+def _check_critic(config: Config) -> None:
+    critic = config.critic
+    if critic.critic == "mlp":
+        return
+    _require(
+        config.agent != "sac",
+        f"critic={critic.critic!r}: agent=sac sees one step; use critic=mlp, or agent=sacformer",
+    )
+    _require(
+        critic.critic_width % critic.critic_heads == 0,
+        f"critic_heads={critic.critic_heads}: must divide critic_width={critic.critic_width}",
+    )
+    _require(
+        not critic.critic_layer_norm,
+        "critic_layer_norm=True: is for critic=mlp; a transformer has its own",
+    )
 
 
 def _check_steps(config: Config) -> None:

@@ -21,6 +21,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("types",),
     ("context", "transformer", "distributions", "normalizer"),
     ("networks",),
+    ("critics",),
     ("buffer",),
     ("rollout",),
     ("agents",),

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gpt2 import dense, gpt2_block, layer_norm, randomized
 
-from sacformer_jax.networks import TransformerActor, twin_critic
+from sacformer_jax.networks import TransformerActor
 from sacformer_jax.transformer import Dropout, TransformerConfig, banded_causal_mask
 
 OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
@@ -31,49 +32,7 @@ def make_inputs(states=K, seed=0):
     }
 
 
-def randomized(params, seed=1, scale=0.4):
-    """Parameters far from their initialization, biases and LayerNorm gains included."""
-    leaves, treedef = jax.tree.flatten(params)
-    rng = np.random.default_rng(seed)
-    noisy = [np.asarray(x + scale * rng.normal(size=x.shape), np.float32) for x in leaves]
-    return jax.tree.unflatten(treedef, noisy)
-
-
 # --- the oracle: plain NumPy in float64 ------------------------------------------------------
-
-
-def layer_norm(x, p):
-    mean, variance = x.mean(-1, keepdims=True), x.var(-1, keepdims=True)
-    return (x - mean) / np.sqrt(variance + 1e-5) * p["scale"] + p["bias"]
-
-
-def dense(x, p):
-    return x @ p["kernel"] + p["bias"]
-
-
-def gpt2_block(x, p, heads, allowed):
-    """Pre-LayerNorm attention and MLP; every token computed."""
-    tokens, width = x.shape
-    h = layer_norm(x, p["ln_1"])
-    if "query_key_value" in p:
-        q, k, v = np.split(dense(h, p["query_key_value"]), 3, axis=-1)
-    else:
-        q = dense(h, p["query"])
-        k, v = np.split(dense(h, p["key_value"]), 2, axis=-1)
-    size = width // heads
-    mixed = np.zeros((tokens, width))
-    for head in range(heads):
-        part = slice(head * size, (head + 1) * size)
-        for i in range(tokens):
-            scores = np.array(
-                [q[i, part] @ k[j, part] / np.sqrt(size) if allowed[i, j] else -np.inf
-                 for j in range(tokens)]
-            )  # fmt: skip
-            weights = np.exp(scores - scores.max())
-            mixed[i, part] = (weights / weights.sum()) @ v[:, part]
-    x = x + dense(mixed, p["attention_out"])
-    h = layer_norm(x, p["ln_2"])
-    return x + dense(np.maximum(dense(h, p["mlp_in"]), 0.0), p["mlp_out"])
 
 
 def oracle(params, inputs, layers, heads, band):
@@ -210,19 +169,3 @@ def test_dropout_is_on_only_where_asked_for():
 
     assert not np.allclose(mean(jax.random.key(0)), mean(jax.random.key(1)))
     np.testing.assert_array_equal(mean(jax.random.key(0)), mean(jax.random.key(0)))
-
-
-def test_twin_critics_are_two_mlps():
-    critic = twin_critic((8, 8), "relu", layer_norm=False)
-    rng = np.random.default_rng(0)
-    obs, action = rng.normal(size=(7, OBS)), rng.normal(size=(7, ACT))
-    params = jax.jit(critic.init)(jax.random.key(0), obs, action)
-    q = jax.jit(critic.apply)(params, obs, action)
-    assert q.shape == (2, 7)
-    assert not np.allclose(q[0], q[1])
-    for i in range(2):
-        p = jax.tree.map(lambda x, i=i: np.asarray(x[i], np.float64), params["params"])
-        x = np.concatenate([obs, action], axis=-1)
-        for layer in ("dense_0", "dense_1"):
-            x = np.maximum(dense(x, p["mlp"][layer]), 0.0)
-        np.testing.assert_allclose(q[i], dense(x, p["q"])[:, 0], rtol=1e-4, atol=1e-5)

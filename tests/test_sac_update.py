@@ -13,7 +13,8 @@ from probe import point_config, point_env
 
 from sacformer_jax import agents
 from sacformer_jax.agents.sac_update import bellman_target, soft_update, weighted_mean
-from sacformer_jax.networks import TransformerActor, twin_critic
+from sacformer_jax.critics import MLPCritic, twin
+from sacformer_jax.networks import TransformerActor
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.transformer import TransformerConfig
 from sacformer_jax.types import Window
@@ -64,7 +65,7 @@ def networks(config, spec):
     actor = TransformerActor(
         TransformerConfig(1, 16, 1, 4, 0.0, "relu"), 1, K, spec.max_episode_steps + 1, 0.01
     )
-    return actor, twin_critic((32, 32), "relu", False)
+    return actor, twin(MLPCritic)((32, 32), "relu", False)
 
 
 # --- by hand ---------------------------------------------------------------------------------

@@ -17,9 +17,10 @@ from sacformer_jax import normalizer
 from sacformer_jax.agents.core import Agent, Metrics
 from sacformer_jax.config import Conditioning, Config
 from sacformer_jax.context import commanded_return_to_go
+from sacformer_jax.critics import CriticInputs, TwinCritics, make_critics
 from sacformer_jax.distributions import TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import GaussianParams, twin_critic
+from sacformer_jax.networks import GaussianParams, max_time_step
 from sacformer_jax.types import (
     Context,
     Hyperparameters,
@@ -36,7 +37,7 @@ class SACParts:
 
     Attributes:
       actor: network of the signature of :class:`~sacformer_jax.networks.TransformerActor`.
-      critic: twin critics, ``(obs, action) -> [2, ...]``.
+      critics: twin critics over windows.
       distribution: the policy's distribution over the action bounds.
       obs_size: O.
       action_size: A.
@@ -48,7 +49,7 @@ class SACParts:
     """
 
     actor: nn.Module
-    critic: nn.Module
+    critics: TwinCritics
     distribution: TanhGaussian
     obs_size: int
     action_size: int
@@ -61,14 +62,9 @@ class SACParts:
 
 def sac_parts(config: Config, spec: EnvSpec, actor: nn.Module) -> SACParts:
     """The parts that a configuration and an environment ask for, around ``actor``."""
-    critic = config.critic
     return SACParts(
         actor=actor,
-        critic=twin_critic(
-            (critic.critic_width,) * critic.critic_layers,
-            critic.critic_activation,
-            critic.critic_layer_norm,
-        ),
+        critics=make_critics(config.critic, config.context.context_length, max_time_step(spec)),
         distribution=TanhGaussian(spec.action_low, spec.action_high),
         obs_size=spec.obs_size,
         action_size=spec.action_size,
@@ -111,9 +107,8 @@ def bellman_target(
 
 def make_sac_agent(parts: SACParts) -> Agent:
     """Binds the parts to the shared SAC functions."""
-    actor, critic, distribution = parts.actor, parts.critic, parts.distribution
+    actor, critics, distribution = parts.actor, parts.critics, parts.distribution
     apply_actor: Callable[..., GaussianParams] = actor.apply  # type: ignore[assignment]
-    apply_critic: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
     adam = optax.scale_by_adam()
 
     def apply_adam(
@@ -147,7 +142,15 @@ def make_sac_agent(parts: SACParts) -> Agent:
             jnp.zeros(states, jnp.int32),
             jnp.ones(states, bool),
         )
-        critic_params = critic.init(critic_key, obs, jnp.zeros((*states, parts.action_size)))
+        critic_params = critics.init(
+            critic_key,
+            CriticInputs(
+                obs=obs,
+                action=jnp.zeros((1, parts.context_length, parts.action_size)),
+                time_step=jnp.zeros(states, jnp.int32),
+                state_mask=jnp.ones(states, bool),
+            ),
+        )
         log_alpha = jnp.log(jnp.float32(parts.initial_alpha))
         return LearnerState(
             actor_params=actor_params,
@@ -206,13 +209,14 @@ def make_sac_agent(parts: SACParts) -> Agent:
         next_action, next_log_prob = distribution.sample_and_log_prob(
             next_key, gaussian.mean[:, 1:], gaussian.log_std[:, 1:]
         )
-        next_q = apply_critic(learner.target_critic_params, obs[:, 1:], next_action)
+        inputs = CriticInputs(obs, window.action, window.time_step, window.state_mask)
+        next_q = critics.following(learner.target_critic_params, inputs, next_action)
         y = bellman_target(
             window.reward, hyper.discount * window.discount, next_q, next_log_prob, alpha
         )
 
         def critic_loss(critic_params: Params) -> tuple[jax.Array, jax.Array]:
-            q = apply_critic(critic_params, obs[:, :-1], window.action)
+            q = critics.now(critic_params, inputs, window.action)
             return weighted_mean(jnp.sum((q - y) ** 2, axis=0), critic_weight), q
 
         (critic_loss_value, q), critic_grads = jax.value_and_grad(critic_loss, has_aux=True)(
@@ -227,7 +231,7 @@ def make_sac_agent(parts: SACParts) -> Agent:
             action, log_prob = distribution.sample_and_log_prob(
                 action_key, gaussian.mean[:, :-1], gaussian.log_std[:, :-1]
             )
-            min_q = jnp.min(apply_critic(critic_params, obs[:, :-1], action), axis=0)
+            min_q = jnp.min(critics.now(critic_params, inputs, action), axis=0)
             return weighted_mean(alpha * log_prob - min_q, actor_weight), log_prob
 
         (actor_loss_value, log_prob), gaussian_grads = jax.value_and_grad(actor_loss, has_aux=True)(

@@ -6,7 +6,7 @@ from sacformer_jax.agents.core import Agent
 from sacformer_jax.agents.sac_update import make_sac_agent, sac_parts
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import TransformerActor
+from sacformer_jax.networks import TransformerActor, max_time_step
 from sacformer_jax.transformer import TransformerConfig
 
 
@@ -24,8 +24,7 @@ def make(config: Config, spec: EnvSpec) -> Agent:
         ),
         action_size=spec.action_size,
         context_length=config.context.context_length,
-        # The state after the last step of an episode has a time step too.
-        max_time_step=spec.max_episode_steps + 1,
+        max_time_step=max_time_step(spec),
         head_init_scale=settings.head_init_scale,
     )
     return make_sac_agent(sac_parts(config, spec, actor))

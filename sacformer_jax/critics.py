@@ -1,0 +1,247 @@
+"""Twin critics over windows: one signature for the MLP and the transformer.
+
+Letters: B windows, K steps, T states (K or K+1), O, A, D width.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.config import CriticConfig
+from sacformer_jax.networks import MLP
+from sacformer_jax.transformer import (
+    LAYER_NORM_EPSILON,
+    Transformer,
+    TransformerConfig,
+    banded_causal_mask,
+)
+from sacformer_jax.types import Params
+
+_MLP_RATIO = 4
+
+
+@flax.struct.dataclass
+class CriticInputs:
+    """What a critic may look at besides the action it judges.
+
+    Attributes:
+      obs: ``[B, K+1, O]``, normalized.
+      action: ``[B, K, A]``, as replayed.
+      time_step: int32 ``[B, K+1]``.
+      state_mask: bool ``[B, K+1]``.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    time_step: jax.Array
+    state_mask: jax.Array
+
+
+Judge = Callable[[Params, CriticInputs, jax.Array], jax.Array]
+"""``(params, inputs, candidate [B, K, A]) -> Q [2, B, K]``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TwinCritics:
+    """Two independent critics as pure functions.
+
+    Attributes:
+      init: ``(key, inputs) -> params``, leaves ``[2, ...]``.
+      now: judges candidates at the first K states.
+      following: judges candidates at the last K states.
+    """
+
+    init: Callable[[jax.Array, CriticInputs], Params]
+    now: Judge
+    following: Judge
+
+
+def make_critics(config: CriticConfig, context_length: int, max_time_step: int) -> TwinCritics:
+    """The critics that a configuration asks for.
+
+    Args:
+      config: the critic's section.
+      context_length: K; no candidate sees more than K states.
+      max_time_step: size of the transformer's time-step embedding.
+    """
+    if config.critic == "mlp":
+        widths = (config.critic_width,) * config.critic_layers
+        return mlp_critics(widths, config.critic_activation, config.critic_layer_norm)
+    trunk = TransformerConfig(
+        layers=config.critic_layers,
+        width=config.critic_width,
+        heads=config.critic_heads,
+        mlp_ratio=_MLP_RATIO,
+        dropout=0.0,
+        activation=config.critic_activation,
+    )
+    return transformer_critics(trunk, context_length, max_time_step)
+
+
+def twin(critic: type[nn.Module]) -> Callable[..., nn.Module]:
+    """Two independent copies; parameters and output lead with their axis."""
+    return nn.vmap(
+        critic,
+        variable_axes={"params": 0},
+        split_rngs={"params": True},
+        in_axes=None,
+        out_axes=0,
+        axis_size=2,
+    )
+
+
+class MLPCritic(nn.Module):
+    """Q(s, a): an MLP on the concatenation."""
+
+    widths: Sequence[int]
+    activation: str
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """``obs [..., O]``, ``action [..., A]`` -> ``[...]``."""
+        x = jnp.concatenate([obs, action], axis=-1)
+        x = MLP(self.widths, self.activation, self.layer_norm, name="mlp")(x)
+        return nn.Dense(1, kernel_init=nn.initializers.lecun_uniform(), name="q")(x)[..., 0]
+
+
+def mlp_critics(widths: Sequence[int], activation: str, layer_norm: bool) -> TwinCritics:
+    """Critics that see the state and the action alone (the paper's)."""
+    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm)
+    apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
+    return TwinCritics(
+        init=lambda key, inputs: critic.init(key, inputs.obs[:, :-1], inputs.action),
+        now=lambda params, inputs, candidate: apply(params, inputs.obs[:, :-1], candidate),
+        following=lambda params, inputs, candidate: apply(params, inputs.obs[:, 1:], candidate),
+    )
+
+
+class TransformerCritic(nn.Module):
+    """Q of one candidate action at every state, given the states and actions before it.
+
+    A triple of tokens stands for each step: state, replayed action, candidate. A candidate sees
+    itself, the states up to its own and the replayed actions before it, and nobody sees a
+    candidate, so all are judged in one pass. Replayed actions are seen from the next step on.
+
+    Attributes:
+      config: the trunk.
+      context_length: K; no position sees more than K steps.
+      max_time_step: size of the time-step embedding.
+    """
+
+    config: TransformerConfig
+    context_length: int
+    max_time_step: int
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: jax.Array,
+        action: jax.Array,
+        candidate: jax.Array,
+        time_step: jax.Array,
+        state_mask: jax.Array,
+    ) -> jax.Array:
+        """Judges the candidates.
+
+        Args:
+          obs: ``[B, T, O]``, normalized.
+          action: ``[B, T, A]``, as replayed; the last one is seen by nobody.
+          candidate: ``[B, T, A]``.
+          time_step: int32 ``[B, T]``.
+          state_mask: bool ``[B, T]``.
+
+        Returns:
+          ``[B, T]``.
+        """
+        width = self.config.width
+        batch, states = time_step.shape
+        xavier = nn.initializers.xavier_uniform()
+        time = nn.Embed(
+            self.max_time_step,
+            width,
+            embedding_init=nn.initializers.normal(0.02),
+            name="embed_time",
+        )(jnp.clip(time_step, 0, self.max_time_step - 1))
+        embed_state = nn.Dense(width, kernel_init=xavier, name="embed_state")
+        embed_action = nn.Dense(width, kernel_init=xavier, name="embed_action")
+        embed_candidate = nn.Dense(width, kernel_init=xavier, name="embed_candidate")
+        triples = [embed_state(obs), embed_action(action), embed_candidate(candidate)]
+        tokens = jnp.stack([triple + time for triple in triples], axis=2)
+        tokens = tokens.reshape(batch, 3 * states, width)  # [B, 3T, D]
+        tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
+        mask = candidate_mask(state_mask, self.context_length)
+        features = Transformer(self.config, group=3, name="trunk")(tokens, mask)
+        return nn.Dense(1, kernel_init=xavier, name="q")(features)[..., 0]  # [B, T]
+
+
+def candidate_mask(state_mask: jax.Array, band: int) -> jax.Array:
+    """Which of the 3T tokens ``(S_1, A_1, C_1, S_2, …)`` may attend to which.
+
+    Args:
+      state_mask: bool ``[B, T]``, real steps.
+      band: how many steps a token sees, its own included.
+
+    Returns:
+      bool ``[B, 3T, 3T]`` (query, key).
+    """
+    batch, states = state_mask.shape
+    upto = banded_causal_mask(state_mask, band)  # [B, T, T]
+    own = jnp.broadcast_to(jnp.eye(states, dtype=bool), upto.shape)
+    before, never = upto & ~own, jnp.zeros_like(upto)
+    visible = [
+        [upto, before, never],  # a state sees states, actions, candidates
+        [upto, upto, never],  # an action
+        [upto, before, own],  # a candidate
+    ]
+    # [B, query step, query kind, key step, key kind]
+    mask = jnp.stack([jnp.stack(keys, axis=-1) for keys in visible], axis=2)
+    return mask.reshape(batch, 3 * states, 3 * states)  # [B, 3T, 3T]
+
+
+def transformer_critics(
+    config: TransformerConfig, context_length: int, max_time_step: int
+) -> TwinCritics:
+    """Critics that see the window up to the action they judge."""
+    critic = twin(TransformerCritic)(config, context_length, max_time_step)
+    apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
+
+    def init(key: jax.Array, inputs: CriticInputs) -> Params:
+        return critic.init(
+            key,
+            inputs.obs[:, :-1],
+            inputs.action,
+            inputs.action,
+            inputs.time_step[:, :-1],
+            inputs.state_mask[:, :-1],
+        )
+
+    def now(params: Params, inputs: CriticInputs, candidate: jax.Array) -> jax.Array:
+        return apply(
+            params,
+            inputs.obs[:, :-1],
+            inputs.action,
+            candidate,
+            inputs.time_step[:, :-1],
+            inputs.state_mask[:, :-1],
+        )
+
+    def following(params: Params, inputs: CriticInputs, candidate: jax.Array) -> jax.Array:
+        nothing = jnp.zeros_like(candidate[:, :1])
+        q = apply(
+            params,
+            inputs.obs,
+            jnp.concatenate([inputs.action, nothing], axis=1),  # [B, K+1, A]
+            jnp.concatenate([nothing, candidate], axis=1),  # [B, K+1, A]
+            inputs.time_step,
+            inputs.state_mask,
+        )
+        return q[..., 1:]  # [2, B, K]
+
+    return TwinCritics(init, now, following)
