@@ -75,14 +75,15 @@ def after(env: MujocoEnv, states: Any, actions: np.ndarray) -> tuple[Any, dict[s
 
 def mjx_states(engine: MjxEngine, native: NativeEngine, words: np.ndarray) -> Any:
     """The same states for MJX."""
-    model, states = native.model, []
+    model, values = native.model, []
     data = mujoco.MjData(model)
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
     for physics, measured in zip(*native.unpack_state(words), strict=True):
         mujoco.mj_setState(model, data, physics, spec)
-        values = (data.qpos, data.qvel, data.qacc_warmstart, measured)
-        states.append(engine.state(*(jnp.asarray(v, jnp.float32) for v in values)))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        values.append((data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy(), measured))
+    return jax.vmap(engine.state)(
+        *(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*values, strict=True))
+    )
 
 
 def errors(actual: Any, expected: Any) -> dict[str, float]:

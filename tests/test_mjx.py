@@ -66,12 +66,13 @@ def case(name: str) -> SimpleNamespace:
     model, data = reference.engine.model, mujoco.MjData(reference.engine.model)
 
     env = make_env(name, "mjx")
-    states = []
+    values = []
     for physics, measured in zip(*reference.engine.unpack_state(words), strict=True):
         mujoco.mj_setState(model, data, physics, native._STATE_SPEC)
-        values = (data.qpos, data.qvel, data.qacc_warmstart, measured)
-        states.append(env.engine.state(*(jnp.asarray(v, jnp.float32) for v in values)))
-    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        values.append((data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy(), measured))
+    states = jax.vmap(env.engine.state)(
+        *(jnp.asarray(np.stack(column), jnp.float32) for column in zip(*values, strict=True))
+    )
 
     # One compilation for all tests of a task, which takes most of their time.
     @jax.jit
