@@ -28,7 +28,7 @@ from sacformer_jax.envs.native import NativeEngine
 from sacformer_jax.envs.physics import EngineChoice
 
 RESULTS = Path(__file__).parent / "results" / "engines.json"
-NUM_ENVS, NUM_STEPS = 64, 16
+NUM_ENVS, NUM_STEPS = 64, 6
 ITERATIONS = ((1, 4), (2, 4), (4, 8), (8, 8))
 Sample = tuple[Any, np.ndarray]
 

@@ -21,6 +21,8 @@ EngineName = Literal["auto", "native", "mjx"]
 MjxPreset = Literal["parity", "fast"]
 MjxImpl = Literal["jax", "warp"]
 BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
+Tokens = Literal["gs", "gsa"]
+ComputeDtype = Literal["float32", "bfloat16"]
 CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
@@ -95,6 +97,8 @@ class ContextConfig:
     """Every return-to-go is divided by this."""
     rtg_discount: float = 0.99
     """Discount of hindsight return-to-go; 1 for none."""
+    tokens: Tokens = "gs"
+    """Tokens of a step: return-to-go and state (gs), or the action taken there too (gsa)."""
     normalize_obs: bool = False
     """Normalize observations by their running mean and variance."""
 
@@ -138,6 +142,14 @@ class CriticConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class PrecisionConfig:
+    """Precision of all networks."""
+
+    compute_dtype: ComputeDtype = "float32"
+    """Matrix products of actor and critics; everything else is float32."""
+
+
+@dataclasses.dataclass(frozen=True)
 class SacConfig:
     """The soft actor-critic update."""
 
@@ -175,6 +187,7 @@ class Config:
     context: ContextConfig = dataclasses.field(default_factory=ContextConfig)
     actor: ActorConfig = dataclasses.field(default_factory=ActorConfig)
     critic: CriticConfig = dataclasses.field(default_factory=CriticConfig)
+    precision: PrecisionConfig = dataclasses.field(default_factory=PrecisionConfig)
     sac: SacConfig = dataclasses.field(default_factory=SacConfig)
 
     @classmethod

@@ -62,17 +62,20 @@ class TwinCritics:
     following: Judge
 
 
-def make_critics(config: CriticConfig, context_length: int, max_time_step: int) -> TwinCritics:
+def make_critics(
+    config: CriticConfig, dtype: str, context_length: int, max_time_step: int
+) -> TwinCritics:
     """The critics that a configuration asks for.
 
     Args:
       config: the critic's section.
+      dtype: of the products.
       context_length: K; no candidate sees more than K states.
       max_time_step: size of the transformer's time-step embedding.
     """
     if config.critic == "mlp":
         widths = (config.critic_width,) * config.critic_layers
-        return mlp_critics(widths, config.critic_activation, config.critic_layer_norm)
+        return mlp_critics(widths, config.critic_activation, config.critic_layer_norm, dtype)
     trunk = TransformerConfig(
         layers=config.critic_layers,
         width=config.critic_width,
@@ -80,6 +83,7 @@ def make_critics(config: CriticConfig, context_length: int, max_time_step: int) 
         mlp_ratio=_MLP_RATIO,
         dropout=0.0,
         activation=config.critic_activation,
+        dtype=dtype,
     )
     return transformer_critics(trunk, context_length, max_time_step)
 
@@ -102,18 +106,21 @@ class MLPCritic(nn.Module):
     widths: Sequence[int]
     activation: str
     layer_norm: bool
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
         """``obs [..., O]``, ``action [..., A]`` -> ``[...]``."""
         x = jnp.concatenate([obs, action], axis=-1)
-        x = MLP(self.widths, self.activation, self.layer_norm, name="mlp")(x)
+        x = MLP(self.widths, self.activation, self.layer_norm, self.dtype, name="mlp")(x)
         return nn.Dense(1, kernel_init=nn.initializers.lecun_uniform(), name="q")(x)[..., 0]
 
 
-def mlp_critics(widths: Sequence[int], activation: str, layer_norm: bool) -> TwinCritics:
+def mlp_critics(
+    widths: Sequence[int], activation: str, layer_norm: bool, dtype: str = "float32"
+) -> TwinCritics:
     """Critics that see the state and the action alone (the paper's)."""
-    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm)
+    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm, dtype)
     apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
     return TwinCritics(
         init=lambda key, inputs: critic.init(key, inputs.obs[:, :-1], inputs.action),
@@ -177,7 +184,7 @@ class TransformerCritic(nn.Module):
         tokens = tokens.reshape(batch, 3 * states, width)  # [B, 3T, D]
         tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
         mask = candidate_mask(state_mask, self.context_length)
-        features = Transformer(self.config, group=3, name="trunk")(tokens, mask)
+        features = Transformer(self.config, kept=(2, 3), name="trunk")(tokens, mask)
         return nn.Dense(1, kernel_init=xavier, name="q")(features)[..., 0]  # [B, T]
 
 

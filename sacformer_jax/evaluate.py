@@ -49,7 +49,9 @@ def make_evaluator(
         reward = jnp.where(progress.running, step.reward, 0.0)
         return _Progress(
             env=env_state,
-            context=contexts.advance(progress.context, step.next_obs, step.reward, step.done),
+            context=contexts.advance(
+                progress.context, action, step.next_obs, step.reward, step.done
+            ),
             running=progress.running & ~step.done,
             result=Evaluation(
                 returns=progress.result.returns + reward,
@@ -62,7 +64,7 @@ def make_evaluator(
         env_state = env.init(key)
         progress = _Progress(
             env=env_state,
-            context=contexts.start(env_state.obs, context_length),
+            context=contexts.start(env_state.obs, context_length, env.spec.action_size),
             running=jnp.ones(env.num_envs, bool),
             result=Evaluation(
                 returns=jnp.zeros(env.num_envs), lengths=jnp.zeros(env.num_envs, jnp.int32)

@@ -9,6 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.config import Tokens
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.transformer import (
     ACTIVATIONS,
@@ -59,8 +60,11 @@ class GaussianHeads(nn.Module):
 class TransformerActor(nn.Module):
     """The Decision-Transformer actor over ``(G_1, S_1, …, G_T, S_T)`` (paper, section 3.1).
 
+    With ``tokens="gsa"`` over ``(G_1, S_1, A_1, …)``, as Decision Transformer (arXiv 2106.01345).
+
     Attributes:
       config: the trunk.
+      tokens: ``"gs"`` or ``"gsa"``.
       action_size: A.
       context_length: K; no position sees more than K pairs.
       max_time_step: size of the time-step embedding.
@@ -72,11 +76,13 @@ class TransformerActor(nn.Module):
     context_length: int
     max_time_step: int
     head_init_scale: float
+    tokens: Tokens = "gs"
 
     @nn.compact
     def __call__(
         self,
         obs: jax.Array,
+        action: jax.Array,
         return_to_go: jax.Array,
         time_step: jax.Array,
         state_mask: jax.Array,
@@ -86,6 +92,8 @@ class TransformerActor(nn.Module):
 
         Args:
           obs: ``[B, T, O]``, normalized.
+          action: ``[B, T, A]``, the actions taken; each is seen from the next state on, the last
+            one by nobody, and none at all with ``tokens="gs"``.
           return_to_go: ``[B, T]``, scaled.
           time_step: int32 ``[B, T]``.
           state_mask: bool ``[B, T]``, real pairs.
@@ -105,36 +113,49 @@ class TransformerActor(nn.Module):
         )(jnp.clip(time_step, 0, self.max_time_step - 1))
         embed_return = nn.Dense(width, kernel_init=xavier, name="embed_return")
         embed_state = nn.Dense(width, kernel_init=xavier, name="embed_state")
-        pairs = [embed_return(return_to_go[..., None]) + time, embed_state(obs) + time]
-        tokens = jnp.stack(pairs, axis=2).reshape(batch, 2 * states, width)  # [B, 2T, D]
+        step = [embed_return(return_to_go[..., None]) + time, embed_state(obs) + time]
+        if self.tokens == "gsa":
+            embed_action = nn.Dense(width, kernel_init=xavier, name="embed_action")
+            step.append(embed_action(action) + time)
+        n = len(step)
+        tokens = jnp.stack(step, axis=2).reshape(batch, n * states, width)  # [B, nT, D]
         tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
 
-        # Both tokens of a pair share its place in the band; a G token must not see its own S.
-        pair_mask = banded_causal_mask(state_mask, self.context_length)
-        token_mask = jnp.repeat(jnp.repeat(pair_mask, 2, axis=1), 2, axis=2)  # [B, 2T, 2T]
-        token_mask &= jnp.tril(jnp.ones((2 * states, 2 * states), bool))
+        # All tokens of a step share its place in the band; within a step, none sees a later one.
+        step_mask = banded_causal_mask(state_mask, self.context_length)
+        token_mask = jnp.repeat(jnp.repeat(step_mask, n, axis=1), n, axis=2)  # [B, nT, nT]
+        token_mask &= jnp.tril(jnp.ones((n * states, n * states), bool))
         # State tokens are the second ones.
-        features = Transformer(self.config, group=2, name="trunk")(
+        features = Transformer(self.config, kept=(1, n), name="trunk")(
             tokens, token_mask, deterministic
         )
         return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
 
 
 class MLP(nn.Module):
-    """Dense layers with an activation after each, optionally LayerNorm before it."""
+    """Dense layers with an activation after each, optionally LayerNorm before it.
+
+    Attributes:
+      widths: of the layers.
+      activation: one of :data:`~sacformer_jax.transformer.ACTIVATIONS`.
+      layer_norm: LayerNorm before each activation.
+      dtype: of the products; the output is float32.
+    """
 
     widths: Sequence[int]
     activation: str = "relu"
     layer_norm: bool = False
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for i, width in enumerate(self.widths):
-            x = nn.Dense(width, kernel_init=nn.initializers.lecun_uniform(), name=f"dense_{i}")(x)
+            init = nn.initializers.lecun_uniform()
+            x = nn.Dense(width, kernel_init=init, dtype=self.dtype, name=f"dense_{i}")(x)
             if self.layer_norm:
                 x = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name=f"ln_{i}")(x)
             x = ACTIVATIONS[self.activation](x)
-        return x
+        return x.astype(jnp.float32)
 
 
 class MLPActor(nn.Module):
@@ -144,16 +165,18 @@ class MLPActor(nn.Module):
     activation: str
     action_size: int
     head_init_scale: float
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(
         self,
         obs: jax.Array,
+        action: jax.Array,
         return_to_go: jax.Array,
         time_step: jax.Array,
         state_mask: jax.Array,
         deterministic: bool = True,
     ) -> GaussianParams:
-        del return_to_go, time_step, state_mask, deterministic
-        features = MLP(self.widths, self.activation, name="mlp")(obs)
+        del action, return_to_go, time_step, state_mask, deterministic
+        features = MLP(self.widths, self.activation, dtype=self.dtype, name="mlp")(obs)
         return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)

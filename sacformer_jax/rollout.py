@@ -61,7 +61,7 @@ def start(env: VectorEnv, buffer: TrajectoryBuffer, key: jax.Array) -> RolloutSt
     env_state = env.init(key)
     return RolloutState(
         env=env_state,
-        context=contexts.start(env_state.obs, buffer.context_length),
+        context=contexts.start(env_state.obs, buffer.context_length, buffer.action_size),
         buffer=buffer.init(),
     )
 
@@ -106,7 +106,7 @@ def collect(
         )
         next_state = RolloutState(
             env=env_state,
-            context=contexts.advance(context, step.next_obs, step.reward, step.done),
+            context=contexts.advance(context, action, step.next_obs, step.reward, step.done),
             buffer=buffer.add(state.buffer, transition),
         )
         return next_state, (stats, transition.obs)

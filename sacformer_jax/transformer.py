@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
 LAYER_NORM_EPSILON = 1e-5
+EVERY_TOKEN = (0, 1)
 _MASKED = -1e9
 
 
@@ -27,6 +28,7 @@ class TransformerConfig:
       mlp_ratio: hidden width of the block's MLP over D.
       dropout: rate on embeddings, attention weights and both residual branches.
       activation: one of :data:`ACTIVATIONS`.
+      dtype: of the products; parameters, LayerNorm, softmax and the residual stream stay float32.
     """
 
     layers: int
@@ -35,6 +37,7 @@ class TransformerConfig:
     mlp_ratio: int
     dropout: float
     activation: str
+    dtype: str = "float32"
 
 
 class Dropout(nn.Module):
@@ -56,12 +59,11 @@ class Block(nn.Module):
 
     Attributes:
       config: the trunk's.
-      group: tokens come in groups of this size, and only the last of each is computed; all are
-        still attended to.
+      kept: ``(first, step)``: compute only these tokens; all are still attended to.
     """
 
     config: TransformerConfig
-    group: int = 1
+    kept: tuple[int, int] = EVERY_TOKEN
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool) -> jax.Array:
@@ -69,36 +71,37 @@ class Block(nn.Module):
         cfg = self.config
         batch, _, width = x.shape
         head_width = width // cfg.heads
-        projection = nn.initializers.normal(0.02)
+
+        def project(size: int, name: str) -> nn.Dense:
+            init = nn.initializers.normal(0.02)
+            return nn.Dense(size, kernel_init=init, dtype=cfg.dtype, name=name)
+
         dropout = Dropout(cfg.dropout, name="dropout")
 
         normed = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_1")(x)
-        if self.group > 1:
-            last = slice(self.group - 1, None, self.group)
-            x, queries, mask = x[:, last], normed[:, last], mask[:, last]
-            q = nn.Dense(width, kernel_init=projection, name="query")(queries)
-            kv = nn.Dense(2 * width, kernel_init=projection, name="key_value")(normed)
-            k, v = jnp.split(kv, 2, axis=-1)
+        if self.kept != EVERY_TOKEN:
+            first, step = self.kept
+            kept = slice(first, None, step)
+            x, queries, mask = x[:, kept], normed[:, kept], mask[:, kept]
+            q = project(width, "query")(queries)
+            k, v = jnp.split(project(2 * width, "key_value")(normed), 2, axis=-1)
         else:
-            qkv = nn.Dense(3 * width, kernel_init=projection, name="query_key_value")(normed)
-            q, k, v = jnp.split(qkv, 3, axis=-1)
+            q, k, v = jnp.split(project(3 * width, "query_key_value")(normed), 3, axis=-1)
 
         def split_heads(y: jax.Array) -> jax.Array:
             return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
 
         q, k, v = split_heads(q), split_heads(k), split_heads(v)
-        scores = jnp.einsum("bhsd,bhtd->bhst", q, k) / jnp.sqrt(head_width)
+        scores = jnp.einsum("bhsd,bhtd->bhst", q, k).astype(jnp.float32) / jnp.sqrt(head_width)
         weights = jax.nn.softmax(jnp.where(mask[:, None], scores, _MASKED), axis=-1)
-        mixed = jnp.einsum("bhst,bhtd->bhsd", dropout(weights, deterministic), v)
+        weights = dropout(weights, deterministic).astype(v.dtype)
+        mixed = jnp.einsum("bhst,bhtd->bhsd", weights, v)
         mixed = mixed.swapaxes(1, 2).reshape(batch, -1, width)  # [B, S, D]
-        attended = nn.Dense(width, kernel_init=projection, name="attention_out")(mixed)
-        x = x + dropout(attended, deterministic)
+        x = x + dropout(project(width, "attention_out")(mixed), deterministic)
 
         hidden = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_2")(x)
-        hidden = nn.Dense(cfg.mlp_ratio * width, kernel_init=projection, name="mlp_in")(hidden)
-        hidden = ACTIVATIONS[cfg.activation](hidden)
-        hidden = nn.Dense(width, kernel_init=projection, name="mlp_out")(hidden)
-        return x + dropout(hidden, deterministic)
+        hidden = ACTIVATIONS[cfg.activation](project(cfg.mlp_ratio * width, "mlp_in")(hidden))
+        return x + dropout(project(width, "mlp_out")(hidden), deterministic)
 
 
 class Transformer(nn.Module):
@@ -106,12 +109,11 @@ class Transformer(nn.Module):
 
     Attributes:
       config: sizes.
-      group: tokens come in groups of this size, and only the last of each is returned; the last
-        block then computes only those.
+      kept: ``(first, step)``: return only these tokens; the last block then computes only those.
     """
 
     config: TransformerConfig
-    group: int = 1
+    kept: tuple[int, int] = EVERY_TOKEN
 
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool = True) -> jax.Array:
@@ -124,12 +126,12 @@ class Transformer(nn.Module):
           deterministic: dropout off.
 
         Returns:
-          ``[B, T/group, D]``.
+          ``[B, S, D]``, the kept tokens.
         """
         x = Dropout(self.config.dropout, name="dropout")(x, deterministic)
         for i in range(self.config.layers):
             last = i == self.config.layers - 1
-            block = Block(self.config, self.group if last else 1, name=f"block_{i}")
+            block = Block(self.config, self.kept if last else EVERY_TOKEN, name=f"block_{i}")
             x = block(x, mask, deterministic)
         return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_f")(x)
 

@@ -24,12 +24,14 @@ class Context:
 
     Attributes:
       obs: ``[N, K, O]`` raw observations.
+      action: ``[N, K, A]`` the actions taken; zero at the newest pair.
       return_so_far: ``[N, K]`` reward collected in the episode before that state.
       time_step: int32 ``[N, K]`` steps taken in the episode before that state.
       mask: bool ``[N, K]`` whether the pair exists.
     """
 
     obs: jax.Array
+    action: jax.Array
     return_so_far: jax.Array
     time_step: jax.Array
     mask: jax.Array

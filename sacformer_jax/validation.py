@@ -66,6 +66,11 @@ def _check_actor(config: Config) -> None:
             f"return_conditioning={context.return_conditioning!r}: agent=sac sees no return; "
             "use return_conditioning=none, or agent=sacformer",
         )
+        _require(
+            context.tokens == "gs",
+            f"tokens={context.tokens!r}: agent=sac sees no actions; use tokens=gs, "
+            "or agent=sacformer",
+        )
     else:
         _require(
             actor.actor_width % actor.actor_heads == 0,

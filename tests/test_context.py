@@ -11,19 +11,20 @@ from sacformer_jax import context as contexts
 
 def test_context_keeps_the_last_k_pairs_and_clears_at_a_reset():
     # Two environments; the second one's episode ends at the second step.
-    context = contexts.start(jnp.array([[10.0], [20.0]]), 3)
+    context = contexts.start(jnp.array([[10.0], [20.0]]), 3, action_size=1)
     assert context.mask.tolist() == [[False, False, True]] * 2
     assert context.obs[:, -1, 0].tolist() == [10.0, 20.0]
     steps = [
-        ([[11.0], [21.0]], [1.0, 5.0], [False, False]),
-        ([[12.0], [90.0]], [2.0, 6.0], [False, True]),
-        ([[13.0], [91.0]], [3.0, 7.0], [False, False]),
+        ([[0.1], [0.4]], [[11.0], [21.0]], [1.0, 5.0], [False, False]),
+        ([[0.2], [0.5]], [[12.0], [90.0]], [2.0, 6.0], [False, True]),
+        ([[0.3], [0.6]], [[13.0], [91.0]], [3.0, 7.0], [False, False]),
     ]
-    for next_obs, reward, done in steps:
-        context = jax.jit(contexts.advance)(
-            context, jnp.array(next_obs), jnp.array(reward), jnp.array(done)
-        )
+    for step in steps:
+        context = jax.jit(contexts.advance)(context, *map(jnp.array, step))
     assert context.obs[..., 0].tolist() == [[11.0, 12.0, 13.0], [21.0, 90.0, 91.0]]
+    # An action stands beside the state it was done in; the newest is still to come.
+    np.testing.assert_allclose(context.action[0, :, 0], [0.2, 0.3, 0.0])
+    np.testing.assert_allclose(context.action[1, 1:, 0], [0.6, 0.0])
     assert context.mask.tolist() == [[True, True, True], [False, True, True]]
     assert context.time_step.tolist()[0] == [1, 2, 3]
     assert context.time_step.tolist()[1][1:] == [0, 1]

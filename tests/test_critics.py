@@ -172,7 +172,9 @@ def test_the_configuration_decides():
     inputs = make_inputs()
     for name, key in (("mlp", "mlp"), ("transformer", "trunk")):
         config = CriticConfig(critic=name, critic_width=8, critic_heads=2, critic_layers=1)
-        params = make_critics(config, K, MAX_TIME).init(jax.random.key(0), inputs)["params"]
+        params = make_critics(config, "float32", K, MAX_TIME).init(jax.random.key(0), inputs)[
+            "params"
+        ]
         assert key in params
         first, second = (jax.tree.map(lambda x, i=i: x[i], params["q"]) for i in (0, 1))
         assert not np.allclose(first["kernel"], second["kernel"])

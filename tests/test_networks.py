@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,9 @@ from sacformer_jax.transformer import Dropout, TransformerConfig, banded_causal_
 OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
 
 
-def make_actor(layers=3, width=16, heads=1, dropout=0.1, context_length=K):
+def make_actor(layers=3, width=16, heads=1, dropout=0.1, context_length=K, tokens="gs"):
     config = TransformerConfig(layers, width, heads, 4, dropout, "relu")
-    return TransformerActor(config, ACT, context_length, MAX_TIME, head_init_scale=1.0)
+    return TransformerActor(config, ACT, context_length, MAX_TIME, 1.0, tokens)
 
 
 def make_inputs(states=K, seed=0):
@@ -26,6 +28,7 @@ def make_inputs(states=K, seed=0):
     mask[2, -1:] = False  # padded at the end, as a window past an episode's end
     return {
         "obs": rng.normal(size=(BATCH, states, OBS)).astype(np.float32),
+        "action": rng.uniform(-1, 1, (BATCH, states, ACT)).astype(np.float32),
         "return_to_go": rng.normal(size=(BATCH, states)).astype(np.float32),
         "time_step": rng.integers(0, MAX_TIME, (BATCH, states)).astype(np.int32),
         "state_mask": mask,
@@ -35,38 +38,43 @@ def make_inputs(states=K, seed=0):
 # --- the oracle: plain NumPy in float64 ------------------------------------------------------
 
 
-def oracle(params, inputs, layers, heads, band):
+def oracle(params, inputs, layers, heads, band, tokens="gs"):
     params = jax.tree.map(lambda x: np.asarray(x, np.float64), params["params"])
     means, log_stds = [], []
     for b in range(BATCH):
         time = params["embed_time"]["embedding"][inputs["time_step"][b]]
         g = dense(inputs["return_to_go"][b][:, None].astype(float), params["embed_return"]) + time
         s = dense(inputs["obs"][b].astype(float), params["embed_state"]) + time
-        states = len(time)
-        x = np.empty((2 * states, g.shape[1]))
-        x[0::2], x[1::2] = g, s
+        states, n = len(time), len(tokens)
+        x = np.empty((n * states, g.shape[1]))
+        x[0::n], x[1::n] = g, s
+        if tokens == "gsa":
+            x[2::n] = dense(inputs["action"][b].astype(float), params["embed_action"]) + time
         x = layer_norm(x, params["ln_embed"])
-        allowed = np.zeros((2 * states, 2 * states), bool)
-        for i in range(2 * states):
+        allowed = np.zeros((n * states, n * states), bool)
+        for i in range(n * states):
             for j in range(i + 1):
-                same_pair = i // 2 == j // 2
-                in_band = i // 2 - j // 2 < band
-                allowed[i, j] = in_band and (same_pair or inputs["state_mask"][b, j // 2])
+                same_step = i // n == j // n
+                in_band = i // n - j // n < band
+                allowed[i, j] = in_band and (same_step or inputs["state_mask"][b, j // n])
         for layer in range(layers):
             x = gpt2_block(x, params["trunk"][f"block_{layer}"], heads, allowed)
-        x = layer_norm(x, params["trunk"]["ln_f"])[1::2]
+        x = layer_norm(x, params["trunk"]["ln_f"])[1::n]
         means.append(dense(x, params["heads"]["mean"]))
         log_stds.append(np.clip(dense(x, params["heads"]["log_std"]), -20.0, 2.0))
     return np.stack(means), np.stack(log_stds)
 
 
-@pytest.mark.parametrize(("layers", "heads", "states"), [(3, 1, K), (2, 2, K), (2, 4, K + 1)])
-def test_actor_equals_the_numpy_decision_transformer(layers, heads, states):
-    actor = make_actor(layers=layers, heads=heads)
+@pytest.mark.parametrize(
+    ("layers", "heads", "states", "tokens"),
+    [(3, 1, K, "gs"), (2, 2, K, "gs"), (2, 4, K + 1, "gs"), (3, 1, K + 1, "gsa")],
+)
+def test_actor_equals_the_numpy_decision_transformer(layers, heads, states, tokens):
+    actor = make_actor(layers=layers, heads=heads, tokens=tokens)
     inputs = make_inputs(states)
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
     out = jax.jit(actor.apply)(params, **inputs)
-    mean, log_std = oracle(params, inputs, layers, heads, band=K)
+    mean, log_std = oracle(params, inputs, layers, heads, K, tokens)
     real = inputs["state_mask"]
     np.testing.assert_allclose(out.mean[real], mean[real], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(out.log_std[real], log_std[real], rtol=1e-5, atol=1e-5)
@@ -74,10 +82,10 @@ def test_actor_equals_the_numpy_decision_transformer(layers, heads, states):
     assert (log_std[real] < 2.0).any()  # the clip is not all there is
 
 
-@pytest.fixture(scope="module")
-def trained():
+@pytest.fixture(scope="module", params=["gs", "gsa"])
+def trained(request):
     """A one-block actor, where the band is the whole receptive field."""
-    actor = make_actor(layers=1)
+    actor = make_actor(layers=1, tokens=request.param)
     inputs = make_inputs(K + 2)
     inputs["state_mask"][:] = True
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
@@ -89,6 +97,7 @@ def test_step_t_does_not_depend_on_later_steps(trained):
     before = apply(params, **inputs)
     for t in range(K + 1):
         changed = {name: np.array(value) for name, value in inputs.items()}
+        changed["action"][:, t:] += 1.0
         changed["obs"][:, t + 1 :] += 3.0
         changed["return_to_go"][:, t + 1 :] -= 2.0
         changed["time_step"][:, t + 1 :] = 7
@@ -97,12 +106,41 @@ def test_step_t_does_not_depend_on_later_steps(trained):
         assert not np.allclose(after.mean[:, t + 1], before.mean[:, t + 1])
 
 
+def test_actions_are_seen_from_the_next_step_on_if_at_all(trained):
+    apply, params, inputs = trained
+    before = apply(params, **inputs).mean
+    seen = "embed_action" in params["params"]
+    for t in range(K + 2):
+        action = inputs["action"].copy()
+        action[:, t] += 1.0
+        after = apply(params, **{**inputs, "action": action}).mean
+        differs = (np.asarray(after) != np.asarray(before)).any(axis=(0, 2))
+        steps = np.arange(K + 2)
+        np.testing.assert_array_equal(differs, seen & (steps > t) & (steps < t + K))
+
+
+@pytest.mark.parametrize("tokens", ["gs", "gsa"])
+def test_bfloat16_is_close_and_keeps_its_parameters_in_float32(tokens):
+    inputs = make_inputs()
+    actors = [make_actor(tokens=tokens), make_actor(tokens=tokens)]
+    config = dataclasses.replace(actors[1].config, dtype="bfloat16")
+    actors[1] = actors[1].clone(config=config)
+    params = jax.jit(actors[1].init)(jax.random.key(0), **inputs)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    exact, rounded = (jax.jit(actor.apply)(params, **inputs) for actor in actors)
+    assert rounded.mean.dtype == jnp.float32
+    real = inputs["state_mask"]
+    difference = np.abs(rounded.mean - exact.mean)[real].max()
+    assert 1e-5 < difference < 0.03 * np.abs(exact.mean[real]).max()
+
+
 def test_masked_steps_do_not_matter(trained):
     apply, params, inputs = trained
     masked = {name: np.array(value) for name, value in inputs.items()}
     masked["state_mask"][:, 1] = False
     before = apply(params, **masked)
     masked["obs"][:, 1] = 1e3
+    masked["action"][:, 1] = 1e3
     masked["return_to_go"][:, 1] = -1e3
     masked["time_step"][:, 1] = 0
     after = apply(params, **masked)

@@ -334,7 +334,8 @@ def _context_by_hand(observations: np.ndarray, rewards: np.ndarray, length: int)
         return_so_far[0, place] = rewards[:step].sum()
         time_step[0, place] = step
         mask[0, place] = True
-    return Context(*(jnp.asarray(x) for x in (obs, return_so_far, time_step, mask)))
+    action = np.zeros((1, length, 3), np.float32)  # without action tokens, seen by nobody
+    return Context(*(jnp.asarray(x) for x in (obs, action, return_so_far, time_step, mask)))
 
 
 def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy) -> None:

@@ -122,6 +122,7 @@ def test_losses_on_a_fixed_batch_equal_numpy(setup):
     gaussian = actor.apply(
         learner.actor_params,
         window.obs,
+        jnp.zeros((B, K + 1, 1)),  # seen by nobody without action tokens
         (0.0 - window.return_so_far) / 10.0,  # commanded: (target - so far) / scale
         window.time_step,
         window.state_mask,
@@ -204,6 +205,7 @@ def two_pass_update(config, spec, learner, hyper, window, key):
         return actor.apply(
             params,
             window.obs[:, :states],
+            jnp.zeros((B, states, 1)),
             return_to_go[:, :states],
             window.time_step[:, :states],
             window.state_mask[:, :states],

@@ -16,5 +16,6 @@ def make(config: Config, spec: EnvSpec) -> Agent:
         activation=config.actor.actor_activation,
         action_size=spec.action_size,
         head_init_scale=config.actor.head_init_scale,
+        dtype=config.precision.compute_dtype,
     )
     return make_sac_agent(sac_parts(config, spec, actor))

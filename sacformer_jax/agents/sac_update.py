@@ -64,7 +64,12 @@ def sac_parts(config: Config, spec: EnvSpec, actor: nn.Module) -> SACParts:
     """The parts that a configuration and an environment ask for, around ``actor``."""
     return SACParts(
         actor=actor,
-        critics=make_critics(config.critic, config.context.context_length, max_time_step(spec)),
+        critics=make_critics(
+            config.critic,
+            config.precision.compute_dtype,
+            config.context.context_length,
+            max_time_step(spec),
+        ),
         distribution=TanhGaussian(spec.action_low, spec.action_high),
         obs_size=spec.obs_size,
         action_size=spec.action_size,
@@ -138,6 +143,7 @@ def make_sac_agent(parts: SACParts) -> Agent:
         actor_params = actor.init(
             actor_key,
             obs,
+            jnp.zeros((*states, parts.action_size)),
             jnp.zeros(states),
             jnp.zeros(states, jnp.int32),
             jnp.ones(states, bool),
@@ -173,6 +179,7 @@ def make_sac_agent(parts: SACParts) -> Agent:
         gaussian = apply_actor(
             policy.actor_params,
             prepare_obs(policy, context.obs),
+            context.action,
             return_to_go,
             context.time_step,
             context.mask,
@@ -191,11 +198,15 @@ def make_sac_agent(parts: SACParts) -> Agent:
         actor_weight = window.weight[:, None] * window.mask
         critic_weight = window.weight[:, None] * window.bootstrap_mask
 
-        # One causal pass over the K+1 states gives π at t and at t+1.
+        # One causal pass over the K+1 states gives π at t and at t+1. The action at the last state
+        # is not known, and seen by nobody.
+        action = jnp.pad(window.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
+
         def distributions(actor_params: Params) -> GaussianParams:
             return apply_actor(
                 actor_params,
                 obs,
+                action,
                 training_return_to_go(window, hyper),
                 window.time_step,
                 window.state_mask,

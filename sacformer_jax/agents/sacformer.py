@@ -21,10 +21,12 @@ def make(config: Config, spec: EnvSpec) -> Agent:
             mlp_ratio=settings.actor_mlp_ratio,
             dropout=settings.actor_dropout,
             activation=settings.actor_activation,
+            dtype=config.precision.compute_dtype,
         ),
         action_size=spec.action_size,
         context_length=config.context.context_length,
         max_time_step=max_time_step(spec),
         head_init_scale=settings.head_init_scale,
+        tokens=config.context.tokens,
     )
     return make_sac_agent(sac_parts(config, spec, actor))
