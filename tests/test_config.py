@@ -227,7 +227,7 @@ def test_prefill_is_rounded_up_to_whole_vector_steps(
 # --- bad input ---------------------------------------------------------------------------------
 
 BAD: list[tuple[dict[str, Any], str]] = [
-    # What is given, and what the message must hold besides the field's name.
+    # What is given, and what the message must hold besides the first field's name.
     ({"num_env": 3}, "did you mean 'num_envs'"),
     ({"entropy_coefficient": 3}, "'entropy_coefficient' does not exist"),
     ({"task": {"env": "Hopper"}}, "'task' does not exist"),
@@ -279,6 +279,27 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"eval_episodes": -2}, "eval_episodes=-2"),
     ({"context_length": 6, "agent": "sac"}, "agent=sac"),
     ({"return_conditioning": "hindsight", "agent": "sac", "context_length": 1}, "agent=sac"),
+    (
+        {"tokens": "gsa", "agent": "sac", "context_length": 1, "return_conditioning": "none"},
+        "agent=sac",
+    ),
+    (
+        {
+            "critic": "transformer",
+            "agent": "sac",
+            "context_length": 1,
+            "return_conditioning": "none",
+        },
+        "agent=sac",
+    ),
+    ({"critic": "lstm"}, "critic='lstm'"),
+    ({"critic_heads": 3, "critic": "transformer"}, "critic_width="),
+    ({"critic_heads": 0}, "critic_heads=0"),
+    ({"critic_layer_norm": True, "critic": "transformer"}, "critic=mlp"),
+    ({"tokens": "gas"}, "tokens='gas'"),
+    ({"compute_dtype": "float16"}, "compute_dtype='float16'"),
+    ({"mjx_preset": "quick"}, "mjx_preset='quick'"),
+    ({"mjx_impl": "cpp"}, "mjx_impl='cpp'"),
     ({"prefill_env_steps": 90, "return_conditioning": "hindsight"}, "at least 100"),
     ({"prefill_env_steps": 0}, "prefill_env_steps=0"),
     ({"prefill_env_steps": -5}, "prefill_env_steps=-5"),

@@ -13,7 +13,7 @@ from probe import point_config, point_env
 
 from sacformer_jax import agents
 from sacformer_jax.agents.sac_update import bellman_target, soft_update, weighted_mean
-from sacformer_jax.critics import MLPCritic, twin
+from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.transformer import TransformerConfig
@@ -188,6 +188,47 @@ def test_what_is_masked_does_not_matter(setup):
         strict=True,
     ):
         np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_a_transformer_critic_learns_from_the_same_loss():
+    config = point_config(context_length=K, critic="transformer", critic_width=16, critic_heads=2)
+    spec = point_env(1).spec
+    agent = agents.make(config, spec)
+    learner, hyper = jax.jit(agent.init)(jax.random.key(0)), hyperparameters(config, 1)
+    window, key = make_window(), jax.random.key(7)
+    new, metrics = jax.jit(agent.update)(learner, hyper, window, key)
+
+    actor, _ = networks(config, spec)
+    gaussian = actor.apply(
+        learner.actor_params,
+        window.obs,
+        jnp.zeros((B, K + 1, 1)),
+        (0.0 - window.return_so_far) / 10.0,
+        window.time_step,
+        window.state_mask,
+    )
+    critics = make_critics(config.critic, "float32", K, spec.max_episode_steps + 1)
+    inputs = CriticInputs(window.obs, window.action, window.time_step, window.state_mask)
+    next_action, next_log_prob = numpy_sample(
+        jax.tree.map(lambda x: x[:, 1:], gaussian), jax.random.split(key, 3)[1]
+    )
+    next_q = critics.following(
+        learner.target_critic_params, inputs, jnp.asarray(next_action, jnp.float32)
+    ).min(0)
+    alpha = float(jnp.exp(learner.log_alpha))
+    y = window.reward + 0.99 * window.discount * (next_q - alpha * next_log_prob)
+    q = critics.now(learner.critic_params, inputs, window.action)
+    weight = window.weight[:, None] * window.bootstrap_mask
+    expected = (weight * ((q - y) ** 2).sum(0)).sum() / weight.sum()
+    assert float(metrics["critic_loss"]) == pytest.approx(float(expected), rel=1e-4)
+    # Every parameter learns, the embedding of replayed actions included.
+    for name in ("embed_state", "embed_action", "embed_candidate", "q"):
+        moved = jax.tree.map(
+            lambda a, b: np.any(a != b),
+            new.critic_params["params"][name],
+            learner.critic_params["params"][name],
+        )
+        assert all(jax.tree.leaves(moved)), name
 
 
 # --- one pass against two --------------------------------------------------------------------
