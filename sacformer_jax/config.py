@@ -91,8 +91,8 @@ class ContextConfig:
     """K: (return-to-go, state) pairs the actor sees, in acting and in training."""
     return_conditioning: Conditioning = "hindsight"
     """Return-to-go in training: obtained afterwards, commanded (Eq. 1 as in acting), or none."""
-    target_return: float = 5_000.0
-    """G_1 in acting and in commanded conditioning, in units of reward."""
+    target_return: float | Literal["auto"] = 5_000.0
+    """G_1 in acting and in commanded conditioning; auto: the best training return so far, or 0."""
     return_scale: float = 1_000.0
     """Every return-to-go is divided by this."""
     rtg_discount: float = 0.99
@@ -302,17 +302,33 @@ def _unknown(what: str, name: str, known: Any) -> str:
     return f"{what} {name!r} does not exist; {hint}"
 
 
+def _alternatives(union: Any) -> tuple[tuple[Any, ...], Any]:
+    """The words (or None) and the one number type that a union allows."""
+    words: list[Any] = []
+    for member in typing.get_args(union):
+        if typing.get_origin(member) is Literal:
+            words += typing.get_args(member)
+        elif member is type(None):
+            words.append(None)
+        else:
+            kind = member
+    return tuple(words), kind
+
+
 def _coerced(name: str, value: Any, kind: Any) -> Any:
     """``value`` as the field's type, where nothing is lost by it."""
+    if isinstance(kind, python_types.UnionType) or typing.get_origin(kind) is typing.Union:
+        words, kind = _alternatives(kind)
+        if value is None or isinstance(value, str):
+            if value in words:
+                return value
+            other = "".join(f", or {word!r}" for word in words)
+            raise ConfigError(f"{name}={value!r}: must be of type {kind.__name__}{other}")
     if typing.get_origin(kind) is Literal:
         choices = typing.get_args(kind)
         if value not in choices:
             raise ConfigError(f"{name}={value!r}: must be one of {', '.join(map(str, choices))}")
         return value
-    if isinstance(kind, python_types.UnionType):
-        if value is None:
-            return None
-        kind = next(k for k in typing.get_args(kind) if k is not type(None))
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**1000 else math.inf
     if kind is int and isinstance(value, float) and value.is_integer():

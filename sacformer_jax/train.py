@@ -106,7 +106,7 @@ def hyperparameters(config: Config, action_size: int) -> Hyperparameters:
         "discount": sac.discount,
         "tau": sac.tau,
         "target_entropy": target_entropy,
-        "target_return": context.target_return,
+        "target_return": 0.0 if context.target_return == "auto" else context.target_return,
         "return_scale": context.return_scale,
         "rtg_discount": context.rtg_discount,
     }
@@ -212,7 +212,10 @@ class _TrainingFunctions:
             learner = dataclasses.replace(
                 learner, normalizer=normalizer.update(learner.normalizer, obs)
             )
-        counters = state.counters
+        hyper, counters = state.hyper, state.counters
+        if self.config.context.target_return == "auto":
+            best = jnp.maximum(hyper.target_return, stats.return_max)
+            hyper = dataclasses.replace(hyper, target_return=best)
         counters = dataclasses.replace(
             counters,
             env_steps=counters.env_steps + num_steps * self.env.num_envs,
@@ -222,6 +225,7 @@ class _TrainingFunctions:
         state = dataclasses.replace(
             state,
             learner=learner,
+            hyper=hyper,
             env=collected.env,
             context=collected.context,
             buffer=collected.buffer,

@@ -138,7 +138,8 @@ class Hyperparameters:
       discount: γ.
       tau: soft-update coefficient of the target critics.
       target_entropy: what tuning α aims at, in nats.
-      target_return: G_1, in units of reward.
+      target_return: G_1, in units of reward; with ``target_return="auto"`` it rises with the best
+        training return.
       return_scale: every return-to-go is divided by it before the network sees it.
       rtg_discount: discount of hindsight return-to-go.
     """

@@ -45,6 +45,7 @@ def check(config: Config) -> None:
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
     _check_actor(config)
+    _check_target_return(config)
     _check_critic(config)
     _check_steps(config)
 
@@ -76,6 +77,15 @@ def _check_actor(config: Config) -> None:
             actor.actor_width % actor.actor_heads == 0,
             f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",
         )
+
+
+def _check_target_return(config: Config) -> None:
+    context = config.context
+    _require(
+        context.target_return != "auto" or context.return_conditioning != "none",
+        "target_return='auto': return_conditioning=none looks at no return; use hindsight or "
+        "commanded",
+    )
 
 
 def _check_critic(config: Config) -> None:

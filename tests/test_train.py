@@ -136,3 +136,40 @@ def test_sac_is_the_same_update_with_an_mlp():
     config = point_config(agent="sac", context_length=1, return_conditioning="none")
     program = make_program(config, point_env(4))
     assert np.median(learning_curve(program, started(program, seed=1))[1:]) > LEARNT
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"tokens": "gsa"},
+        {"critic": "transformer", "critic_width": 16},
+        {"compute_dtype": "bfloat16"},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_each_variant_learns(options):
+    program = make_program(point_config(**options), point_env(4))
+    assert np.median(learning_curve(program, started(program), chunks=5)[2:]) > LEARNT
+
+
+class GenerousEnv(PointEnv):
+    """Positive rewards."""
+
+    def step(self, state, action):
+        state, step = super().step(state, action)
+        return state, dataclasses.replace(step, reward=step.reward + 10.0)
+
+
+def test_an_automatic_target_is_the_best_return_so_far_and_enters_the_policy():
+    program = make_program(point_config(target_return="auto"), VectorEnv(GenerousEnv(), 4))
+    state = program.init(jax.random.key(0))
+    assert float(state.hyper.target_return) == 0.0
+    state, metrics = program.prefill(state)
+    seen = [float(metrics["episode_return_max"])]
+    assert float(state.hyper.target_return) == seen[0] > 0.0
+    for _ in range(3):
+        state, metrics = program.train_chunk(state)
+        seen.append(float(metrics["episode_return_max"]))
+        assert float(state.hyper.target_return) == max(seen)
+    assert seen[0] < max(seen)
+    assert float(policy_of(state).target_return) == max(seen)
