@@ -303,7 +303,8 @@ class RunFolder:
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                 raise CheckpointError(
                     f"checkpoint {self.path / folder / str(step)} cannot be read ({reason[:200]}): "
-                    "if it is damaged, remove that folder to fall back to the one before"
+                    "if it is damaged, remove that folder to fall back to the one before; if "
+                    "another version of sacformer-jax wrote it, resume with that one"
                 ) from error
         return {name: items[name] for name in ("metadata", *abstract)}
 

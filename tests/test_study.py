@@ -12,6 +12,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import study as studies
 
 from sacformer_jax import Config
 from sacformer_jax.checkpoint import RunFolder
@@ -20,9 +21,6 @@ from sacformer_jax.envs import EnvSpec
 from sacformer_jax.runner import sources_of
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-sys.path.insert(0, str(EXPERIMENTS))
-
-import study as studies  # noqa: E402  (its folder is not a package)
 
 TINY = {
     "agent": "sac", "env": "Hopper", "num_envs": 2, "max_episode_steps": 50,

@@ -165,8 +165,8 @@ class MjxEngine:
                 # Contacts and solver would change nothing that a task reads after a reset.
                 for stage in (mjx.kinematics, mjx.com_pos, mjx.com_vel):
                     data = stage(self._mjx_model, data)
-        # MJX normalizes a free root's quaternion here; C MuJoCo leaves it as it is.
-        return self._output(data.replace(qpos=qpos), jnp.zeros(2), None)
+            # MJX normalizes a free root's quaternion here; C MuJoCo leaves it as it is.
+            return self._output(data.replace(qpos=qpos), jnp.zeros(2), None)
 
     def step(self, state: MjxState, ctrl: jax.Array) -> PhysicsOutput:
         data = self._blank.replace(
@@ -179,7 +179,7 @@ class MjxEngine:
             )
             if "cfrc_ext" in self.task.derived:
                 data = mjx.rne_postconstraint(self._mjx_model, data)
-        return self._output(data, state.origin, state.measured)
+            return self._output(data, state.origin, state.measured)
 
     def step_and_reset(
         self, states: MjxState, ctrls: jax.Array, reset: jax.Array, noise: ResetNoise
@@ -194,7 +194,7 @@ class MjxEngine:
         if self.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
             return mjx.step(self._mjx_model, data)
         # MJX's own Runge-Kutta lays four copies of the dynamics into the program; one copy in a
-        # loop compiles several times faster.
+        # loop compiles in about half the time.
         timestep = self._mjx_model.opt.timestep
 
         def stage(carry: _RungeKutta, tableau: jax.Array) -> tuple[_RungeKutta, None]:
