@@ -152,14 +152,34 @@ def measure(task: str) -> dict[str, Any]:
     return results
 
 
+def summary(results: dict[str, Any]) -> str:
+    """The results as a Markdown table."""
+    lines = [
+        "| task | engine | compile, s | steps/s | qvel: median, 99 %, max | reward: 99 %, max |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for task, settings in results.items():
+        for name, values in settings.items():
+            if not isinstance(values, dict):
+                continue
+            cells = [
+                ", ".join(f"{values[key]:.0e}" for key in keys) if keys[0] in values else "–"
+                for keys in (("qvel_median", "qvel_99", "qvel_max"), ("reward_99", "reward_max"))
+            ]
+            speed = [f"{values[k]:,}" if k in values else "–" for k in ("compile_s", "steps_per_s")]
+            lines.append(f"| {task} | {name} | {' | '.join(speed + cells)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Measures the tasks asked for and keeps what was measured of the others."""
     parser = argparse.ArgumentParser(description="Agreement and speed of the physics engines.")
-    parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
+    parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for task in parser.parse_args().tasks:
-        results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         results[task] = measure(task)
         RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    print(summary(results))
 
 
 if __name__ == "__main__":

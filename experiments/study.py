@@ -9,6 +9,7 @@ results/STUDY.png are written anew; rows of runs that were not asked for stay as
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import dataclasses
 import os
@@ -162,6 +163,8 @@ class Study:
                 if not ended:
                     time.sleep(_POLL_SECONDS)
         finally:
+            for worker in working:  # only after an error here: they are to save and end
+                worker.process.terminate()
             for number, handler in previous.items():
                 signal.signal(number, handler)
         if asked:
@@ -177,8 +180,7 @@ class Study:
         command += [str(core) for core in cores]
         log = self.runs / f"{name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("ab") as file:
-            output = file if cores else None
+        with log.open("ab") if cores else contextlib.nullcontext() as output:
             # A session of its own: the terminal's Ctrl-C reaches only us, who pass it on once.
             process = subprocess.Popen(
                 command, start_new_session=True, stdout=output, stderr=output

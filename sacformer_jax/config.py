@@ -146,7 +146,7 @@ class PrecisionConfig:
     """Precision of all networks."""
 
     compute_dtype: ComputeDtype = "float32"
-    """Matrix products of actor and critics; everything else is float32."""
+    """Matrix products inside actor and critics; embeddings, heads and the rest are float32."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,7 +70,7 @@ def make_critics(
     Args:
       config: the critic's section.
       dtype: of the products.
-      context_length: K; no candidate sees more than K states.
+      context_length: K; no candidate attends to more than K states.
       max_time_step: size of the transformer's time-step embedding.
     """
     if config.critic == "mlp":
@@ -138,7 +138,7 @@ class TransformerCritic(nn.Module):
 
     Attributes:
       config: the trunk.
-      context_length: K; no position sees more than K steps.
+      context_length: K; no position attends to more than K steps.
       max_time_step: size of the time-step embedding.
     """
 

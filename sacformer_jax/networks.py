@@ -66,7 +66,7 @@ class TransformerActor(nn.Module):
       config: the trunk.
       tokens: ``"gs"`` or ``"gsa"``.
       action_size: A.
-      context_length: K; no position sees more than K pairs.
+      context_length: K; no position attends to more than K pairs.
       max_time_step: size of the time-step embedding.
       head_init_scale: see :class:`GaussianHeads`.
     """

@@ -77,6 +77,11 @@ def _check_actor(config: Config) -> None:
             actor.actor_width % actor.actor_heads == 0,
             f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",
         )
+        _require(
+            context.tokens == "gs" or context.context_length > 1,
+            f"tokens={context.tokens!r}: with context_length=1 there is no action before the "
+            "state; use context_length of 2 or more",
+        )
 
 
 def _check_target_return(config: Config) -> None:
@@ -95,6 +100,11 @@ def _check_critic(config: Config) -> None:
     _require(
         config.agent != "sac",
         f"critic={critic.critic!r}: agent=sac sees one step; use critic=mlp, or agent=sacformer",
+    )
+    _require(
+        config.context.context_length > 1,
+        f"critic={critic.critic!r}: with context_length=1 it sees one step; use critic=mlp, or "
+        "context_length of 2 or more",
     )
     _require(
         critic.critic_width % critic.critic_heads == 0,

@@ -292,6 +292,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
         },
         "agent=sac",
     ),
+    ({"tokens": "gsa", "context_length": 1}, "context_length=1"),
+    ({"critic": "transformer", "context_length": 1}, "context_length=1"),
     ({"critic": "lstm"}, "critic='lstm'"),
     ({"critic_heads": 3, "critic": "transformer"}, "critic_width="),
     ({"critic_heads": 0}, "critic_heads=0"),

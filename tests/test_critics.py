@@ -168,6 +168,19 @@ def test_a_candidate_is_judged_by_what_came_before_it_and_itself_alone():
         np.testing.assert_array_equal(now(params, inputs, alone)[..., t], before[..., t])
 
 
+@pytest.mark.parametrize("name", ["mlp", "transformer"])
+def test_bfloat16_is_close_with_parameters_in_float32(name):
+    inputs, candidate = make_inputs(), make_candidate()
+    config = CriticConfig(critic=name, critic_width=32, critic_layers=2)
+    exact, rounded = (make_critics(config, d, K, MAX_TIME) for d in ("float32", "bfloat16"))
+    params = jax.jit(rounded.init)(jax.random.key(0), inputs)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    q, q_rounded = (jax.jit(c.now)(params, inputs, candidate) for c in (exact, rounded))
+    assert q_rounded.dtype == jnp.float32
+    difference = np.abs(q - q_rounded).max()
+    assert 1e-6 < difference < 0.05 * np.abs(q).max()
+
+
 def test_the_configuration_decides():
     inputs = make_inputs()
     for name, key in (("mlp", "mlp"), ("transformer", "trunk")):

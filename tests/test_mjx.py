@@ -254,11 +254,14 @@ def test_the_device_decides_unless_asked(backend, engine, monkeypatch):
 
 
 def test_presets_set_the_solver():
+    for task in TASKS.values():
+        budget = mjx_engine.FAST_ITERATIONS[task.name]
+        opt = MjxEngine(task, "fast").model.opt
+        assert (opt.iterations, opt.ls_iterations) == (budget.newton, budget.line_search)
     parity, fast = (MjxEngine(TASKS["Humanoid"], preset).model.opt for preset in ("parity", "fast"))
     assert parity.solver == fast.solver == mujoco.mjtSolver.mjSOL_NEWTON
     assert (parity.iterations, parity.ls_iterations) == (50, 50)
-    chosen = mjx_engine.FAST_ITERATIONS["Humanoid"]
-    assert (fast.iterations, fast.ls_iterations) == (chosen.newton, chosen.line_search)
+    assert (fast.iterations, fast.ls_iterations) == (4, 8)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from sacformer_jax import (
     ConfigError,
     Policy,
     RunResult,
+    agents,
     evaluate,
     load_policy,
     make_program,
@@ -33,6 +34,7 @@ from sacformer_jax import (
 from sacformer_jax.checkpoint import RunFolder, digest
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.logging import read_records
+from sacformer_jax.train import hyperparameters, policy_state
 from sacformer_jax.types import Context
 
 TOTAL, STOP = 600, 400
@@ -321,30 +323,44 @@ def test_predict_ignores_the_reward_only_after_reset(policy: Policy) -> None:
     assert not np.array_equal(policy.predict(second, 1e3), after_one)
 
 
-def _context_by_hand(observations: np.ndarray, rewards: np.ndarray, length: int) -> Context:
-    """The context at the last observation, ``rewards[i]`` being what step ``i`` gave."""
+def _context_by_hand(
+    observations: np.ndarray, actions: np.ndarray, rewards: np.ndarray, length: int
+) -> Context:
+    """The context at the last observation; step ``i`` was ``actions[i]``, giving ``rewards[i]``."""
     steps = len(observations)
     seen = min(steps, length)
     obs = np.zeros((1, length, 11), np.float32)
     return_so_far = np.zeros((1, length), np.float32)
     time_step = np.zeros((1, length), np.int32)
     mask = np.zeros((1, length), bool)
+    action = np.zeros((1, length, 3), np.float32)
     for place, step in enumerate(range(steps - seen, steps), start=length - seen):
         obs[0, place] = observations[step]
         return_so_far[0, place] = rewards[:step].sum()
         time_step[0, place] = step
         mask[0, place] = True
-    action = np.zeros((1, length, 3), np.float32)  # without action tokens, seen by nobody
+        if step < steps - 1:  # the newest is still to come
+            action[0, place] = actions[step]
     return Context(*(jnp.asarray(x) for x in (obs, action, return_so_far, time_step, mask)))
 
 
-def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy) -> None:
+@pytest.mark.parametrize("tokens", ["gs", "gsa"])
+def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, tokens: str) -> None:
+    if tokens == "gsa":
+        config = policy.config.replace(tokens=tokens, head_init_scale=1.0)
+        agent = agents.make(config, policy.spec)
+        learner = agent.init(jax.random.key(0))
+        state = policy_state(learner, hyperparameters(config, 3))
+        policy = Policy(config, policy.spec, agent, state)
     act = jax.jit(lambda state, context: policy.agent.act(state, context, None))
     for steps in (1, 3, 6, 8):  # K is 6
         observations, rewards = _observations(steps), np.arange(1, steps + 1, dtype=np.float32)
-        expected = act(policy.state, _context_by_hand(observations, rewards, 6))[0]
-        action = _predictions(policy, observations, rewards)[-1]
-        np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-6)
+        actions = _predictions(policy, observations, rewards)
+        context = _context_by_hand(observations, actions, rewards, 6)
+        expected = act(policy.state, context)[0]
+        np.testing.assert_allclose(actions[-1], expected, rtol=1e-4, atol=1e-6)
+        forgotten = act(policy.state, context.replace(action=jnp.zeros_like(context.action)))[0]
+        assert np.allclose(forgotten, expected, atol=1e-6) == (tokens == "gs" or steps == 1)
 
 
 @pytest.mark.parametrize("shape", [(10,), (12,), (1, 11), ()], ids=str)

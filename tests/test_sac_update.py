@@ -52,18 +52,28 @@ def make_window(seed=0, context_length=K) -> Window:
     )
 
 
-@pytest.fixture(scope="module")
-def setup():
-    config = point_config(context_length=K)
+@pytest.fixture(scope="module", params=["gs", "gsa"])
+def setup(request):
+    config = point_config(context_length=K, tokens=request.param)
     env = point_env(1)
     agent = agents.make(config, env.spec)
     learner = jax.jit(agent.init)(jax.random.key(0))
     return config, env.spec, jax.jit(agent.update), learner, hyperparameters(config, 1)
 
 
+def taken(window):
+    """The actions beside the K+1 states; what stands at the last is seen by nobody."""
+    return jnp.concatenate([window.action, jnp.full((len(window.action), 1, 1), 7.0)], axis=1)
+
+
 def networks(config, spec):
     actor = TransformerActor(
-        TransformerConfig(1, 16, 1, 4, 0.0, "relu"), 1, K, spec.max_episode_steps + 1, 0.01
+        TransformerConfig(1, 16, 1, 4, 0.0, "relu"),
+        1,
+        K,
+        spec.max_episode_steps + 1,
+        0.01,
+        config.context.tokens,
     )
     return actor, twin(MLPCritic)((32, 32), "relu", False)
 
@@ -122,7 +132,7 @@ def test_losses_on_a_fixed_batch_equal_numpy(setup):
     gaussian = actor.apply(
         learner.actor_params,
         window.obs,
-        jnp.zeros((B, K + 1, 1)),  # seen by nobody without action tokens
+        taken(window),
         (0.0 - window.return_so_far) / 10.0,  # commanded: (target - so far) / scale
         window.time_step,
         window.state_mask,
@@ -202,7 +212,7 @@ def test_a_transformer_critic_learns_from_the_same_loss():
     gaussian = actor.apply(
         learner.actor_params,
         window.obs,
-        jnp.zeros((B, K + 1, 1)),
+        taken(window),
         (0.0 - window.return_so_far) / 10.0,
         window.time_step,
         window.state_mask,
@@ -246,7 +256,7 @@ def two_pass_update(config, spec, learner, hyper, window, key):
         return actor.apply(
             params,
             window.obs[:, :states],
-            jnp.zeros((B, states, 1)),
+            taken(window)[:, :states],
             return_to_go[:, :states],
             window.time_step[:, :states],
             window.state_mask[:, :states],

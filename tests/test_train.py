@@ -149,7 +149,13 @@ def test_sac_is_the_same_update_with_an_mlp():
 )
 def test_each_variant_learns(options):
     program = make_program(point_config(**options), point_env(4))
-    assert np.median(learning_curve(program, started(program), chunks=5)[2:]) > LEARNT
+    state = started(program)
+    # The option has arrived where it works.
+    assert ("bf16" in program.train_chunk.lower(state).as_text()) == ("compute_dtype" in options)
+    actor, critic = (p["params"] for p in (state.learner.actor_params, state.learner.critic_params))
+    assert ("embed_action" in actor) == ("tokens" in options)
+    assert ("embed_candidate" in critic) == ("critic" in options)
+    assert np.median(learning_curve(program, state, chunks=5)[2:]) > LEARNT
 
 
 class GenerousEnv(PointEnv):

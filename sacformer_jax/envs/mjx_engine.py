@@ -54,7 +54,7 @@ FAST_ITERATIONS = {
     "HalfCheetah": SolverIterations(4, 8),
     "Hopper": SolverIterations(4, 8),
     "Walker2d": SolverIterations(4, 8),
-    "Ant": SolverIterations(4, 8),
+    "Ant": SolverIterations(8, 8),
     "Humanoid": SolverIterations(4, 8),
 }
 
