@@ -1,6 +1,6 @@
 """The physics engines: agreement with Gymnasium's MuJoCo, solver iterations, speed, compile time.
 
-python experiments/engines.py                    # all five tasks: about half an hour on 2 cores
+python experiments/engines.py                    # all five tasks: about ten minutes on 2 cores
 python experiments/engines.py --tasks Hopper
 
 Errors are of single environment steps, from states along trajectories of random actions, against C
@@ -24,7 +24,7 @@ import numpy as np
 from sacformer_jax.envs import TASKS, VectorEnv, make_env, mjx_engine
 from sacformer_jax.envs.mjx_engine import MjxEngine, SolverIterations
 from sacformer_jax.envs.mujoco_env import MujocoEnv
-from sacformer_jax.envs.native import NativeEngine
+from sacformer_jax.envs.native import STATE_SPEC, NativeEngine
 from sacformer_jax.envs.physics import EngineChoice
 
 RESULTS = Path(__file__).parent / "results" / "engines.json"
@@ -79,9 +79,8 @@ def mjx_states(engine: MjxEngine, native: NativeEngine, words: np.ndarray) -> tu
     """The same states for MJX, and the share of them in contact."""
     model, values, touching = native.model, [], 0
     data = mujoco.MjData(model)
-    spec = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
     for physics, measured in zip(*native.unpack_state(words), strict=True):
-        mujoco.mj_setState(model, data, physics, spec)
+        mujoco.mj_setState(model, data, physics, STATE_SPEC)
         values.append((data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy(), measured))
         mujoco.mj_forward(model, data)
         touching += data.ncon > 0
@@ -130,10 +129,12 @@ def measure(task: str) -> dict[str, Any]:
 
     twin = make_env(task, "mjx")
     assert isinstance(twin, MujocoEnv)
+    assert isinstance(twin.engine, MjxEngine)
+    # A state says nothing of the solver's settings.
+    states, results["share in contact"] = mjx_states(twin.engine, native, words)
 
     def add(name: str, **settings: Any) -> None:
-        twin.engine = engine = MjxEngine(TASKS[task], **settings)
-        states, results["share in contact"] = mjx_states(engine, native, words)
+        twin.engine = MjxEngine(TASKS[task], **settings)
         actual, timing = after(twin, states, actions)
         results[name] = {**timing, **errors(actual, expected)}
         results[name]["qvel_max_to_newton"] = errors(actual, newton)["qvel_max"]

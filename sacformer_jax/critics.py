@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax.config import CriticConfig
-from sacformer_jax.networks import MLP
+from sacformer_jax.networks import MLP, embed_steps
 from sacformer_jax.transformer import (
-    LAYER_NORM_EPSILON,
     Transformer,
     TransformerConfig,
     banded_causal_mask,
@@ -167,24 +166,11 @@ class TransformerCritic(nn.Module):
         Returns:
           ``[B, T]``.
         """
-        width = self.config.width
-        batch, states = time_step.shape
-        xavier = nn.initializers.xavier_uniform()
-        time = nn.Embed(
-            self.max_time_step,
-            width,
-            embedding_init=nn.initializers.normal(0.02),
-            name="embed_time",
-        )(jnp.clip(time_step, 0, self.max_time_step - 1))
-        embed_state = nn.Dense(width, kernel_init=xavier, name="embed_state")
-        embed_action = nn.Dense(width, kernel_init=xavier, name="embed_action")
-        embed_candidate = nn.Dense(width, kernel_init=xavier, name="embed_candidate")
-        triples = [embed_state(obs), embed_action(action), embed_candidate(candidate)]
-        tokens = jnp.stack([triple + time for triple in triples], axis=2)
-        tokens = tokens.reshape(batch, 3 * states, width)  # [B, 3T, D]
-        tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
+        step = {"state": obs, "action": action, "candidate": candidate}
+        tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)  # [B, 3T, D]
         mask = candidate_mask(state_mask, self.context_length)
         features = Transformer(self.config, kept=(2, 3), name="trunk")(tokens, mask)
+        xavier = nn.initializers.xavier_uniform()
         return nn.Dense(1, kernel_init=xavier, name="q")(features)[..., 0]  # [B, T]
 
 

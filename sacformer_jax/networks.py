@@ -57,6 +57,34 @@ class GaussianHeads(nn.Module):
         return GaussianParams(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 
 
+def embed_steps(
+    step: dict[str, jax.Array], time_step: jax.Array, width: int, max_time_step: int
+) -> jax.Array:
+    """The tokens of T steps, interleaved; to be called inside a compact module, whose layers
+    ``embed_NAME``, ``embed_time`` and ``ln_embed`` it makes.
+
+    Args:
+      step: what each of a step's n tokens stands for, by name and in order: ``[B, T, ...]``.
+      time_step: int32 ``[B, T]``; its embedding is added to all tokens of the step.
+      width: D.
+      max_time_step: size of the time-step embedding.
+
+    Returns:
+      ``[B, nT, D]``.
+    """
+    batch = time_step.shape[0]
+    time = nn.Embed(
+        max_time_step, width, embedding_init=nn.initializers.normal(0.02), name="embed_time"
+    )(jnp.clip(time_step, 0, max_time_step - 1))
+    xavier = nn.initializers.xavier_uniform()
+    tokens = [
+        nn.Dense(width, kernel_init=xavier, name=f"embed_{name}")(values) + time
+        for name, values in step.items()
+    ]
+    interleaved = jnp.stack(tokens, axis=2).reshape(batch, -1, width)  # [B, nT, D]
+    return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(interleaved)
+
+
 class TransformerActor(nn.Module):
     """The Decision-Transformer actor over ``(G_1, S_1, …, G_T, S_T)`` (paper, section 3.1).
 
@@ -102,24 +130,11 @@ class TransformerActor(nn.Module):
         Returns:
           mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing.
         """
-        width = self.config.width
-        batch, states = time_step.shape
-        xavier = nn.initializers.xavier_uniform()
-        time = nn.Embed(
-            self.max_time_step,
-            width,
-            embedding_init=nn.initializers.normal(0.02),
-            name="embed_time",
-        )(jnp.clip(time_step, 0, self.max_time_step - 1))
-        embed_return = nn.Dense(width, kernel_init=xavier, name="embed_return")
-        embed_state = nn.Dense(width, kernel_init=xavier, name="embed_state")
-        step = [embed_return(return_to_go[..., None]) + time, embed_state(obs) + time]
+        step = {"return": return_to_go[..., None], "state": obs}
         if self.tokens == "gsa":
-            embed_action = nn.Dense(width, kernel_init=xavier, name="embed_action")
-            step.append(embed_action(action) + time)
-        n = len(step)
-        tokens = jnp.stack(step, axis=2).reshape(batch, n * states, width)  # [B, nT, D]
-        tokens = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(tokens)
+            step["action"] = action
+        n, states = len(step), time_step.shape[1]
+        tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)
 
         # All tokens of a step share its place in the band; within a step, none sees a later one.
         step_mask = banded_causal_mask(state_mask, self.context_length)

@@ -52,10 +52,13 @@ class Policy:
 
     def reset(self) -> None:
         """Forgets the episode so far; call it at each ``env.reset()``."""
-        self._context = contexts.empty(
-            1, self.config.context.context_length, self.spec.obs_size, self.spec.action_size
+        spec = self.spec
+        self._last = Acting(
+            context=contexts.empty(
+                1, self.config.context.context_length, spec.obs_size, spec.action_size
+            ),
+            action=jnp.zeros(spec.action_size),
         )
-        self._action = np.zeros(self.spec.action_size, np.float32)
         self._first = True
 
     def predict(self, obs: Any, reward: float = 0.0) -> np.ndarray:
@@ -76,28 +79,23 @@ class Policy:
         if values.shape != (self.spec.obs_size,):
             raise ValueError(f"obs of shape {values.shape}: must be ({self.spec.obs_size},)")
         acting = self._act(
-            self.state,
-            self._context,
-            self._action,
-            values,
-            np.float32(reward),
-            np.bool_(self._first),
+            self.state, self._last, values, np.float32(reward), np.bool_(self._first)
         )
-        self._context, self._first = acting.context, False
-        self._action = np.asarray(acting.action)
-        return self._action.copy()
+        self._last, self._first = acting, False
+        return np.array(acting.action)
 
     def _acting(
         self,
         state: PolicyState,
-        context: Context,
-        last_action: jax.Array,
+        last: Acting,
         obs: jax.Array,
         reward: jax.Array,
         first: jax.Array,
     ) -> Acting:
         # An episode's first state enters like one after a reset.
-        context = contexts.advance(context, last_action[None], obs[None], reward[None], first[None])
+        context = contexts.advance(
+            last.context, last.action[None], obs[None], reward[None], first[None]
+        )
         return Acting(context, jnp.asarray(self.agent.act(state, context, None)[0]))
 
 

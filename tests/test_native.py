@@ -37,8 +37,8 @@ def make(name: str) -> MujocoEnv:
 
 
 def physics_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    state = np.zeros(mujoco.mj_stateSize(model, native._STATE_SPEC))
-    mujoco.mj_getState(model, data, state, native._STATE_SPEC)
+    state = np.zeros(mujoco.mj_stateSize(model, native.STATE_SPEC))
+    mujoco.mj_getState(model, data, state, native.STATE_SPEC)
     return state
 
 
@@ -63,7 +63,7 @@ def edit_state(engine: NativeEngine, words: jax.Array, field: str, value: float)
     """The packed state with the last entry of ``qpos`` or ``qvel`` replaced."""
     physics, measured = engine.unpack_state(np.asarray(words))
     data = mujoco.MjData(engine.model)
-    mujoco.mj_setState(engine.model, data, physics.copy(), native._STATE_SPEC)
+    mujoco.mj_setState(engine.model, data, physics.copy(), native.STATE_SPEC)
     getattr(data, field)[-1] = value
     return jnp.asarray(engine.pack_state(physics_of(engine.model, data), measured))
 

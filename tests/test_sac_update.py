@@ -101,6 +101,18 @@ def test_weighted_mean_and_soft_update():
     np.testing.assert_allclose(moved["w"], [1.01])
 
 
+def shown(config, spec, learner, window):
+    """The policy's distributions at the K+1 states, conditioned on the commanded return."""
+    return networks(config, spec)[0].apply(
+        learner.actor_params,
+        window.obs,
+        taken(window),
+        (0.0 - window.return_so_far) / 10.0,  # (target - so far) / scale
+        window.time_step,
+        window.state_mask,
+    )
+
+
 def numpy_mlp(params, x):
     for layer in ("dense_0", "dense_1"):
         x = np.maximum(x @ params["mlp"][layer]["kernel"] + params["mlp"][layer]["bias"], 0.0)
@@ -128,15 +140,7 @@ def test_losses_on_a_fixed_batch_equal_numpy(setup):
     window, key = make_window(), jax.random.key(7)
     _, metrics = update(learner, hyper, window, key)
 
-    actor, _ = networks(config, spec)
-    gaussian = actor.apply(
-        learner.actor_params,
-        window.obs,
-        taken(window),
-        (0.0 - window.return_so_far) / 10.0,  # commanded: (target - so far) / scale
-        window.time_step,
-        window.state_mask,
-    )
+    gaussian = shown(config, spec, learner, window)
     _, next_key, action_key = jax.random.split(key, 3)
     obs = np.asarray(window.obs, float)
     following = jax.tree.map(lambda x: x[:, 1:], gaussian)
@@ -208,15 +212,7 @@ def test_a_transformer_critic_learns_from_the_same_loss():
     window, key = make_window(), jax.random.key(7)
     new, metrics = jax.jit(agent.update)(learner, hyper, window, key)
 
-    actor, _ = networks(config, spec)
-    gaussian = actor.apply(
-        learner.actor_params,
-        window.obs,
-        taken(window),
-        (0.0 - window.return_so_far) / 10.0,
-        window.time_step,
-        window.state_mask,
-    )
+    gaussian = shown(config, spec, learner, window)
     critics = make_critics(config.critic, "float32", K, spec.max_episode_steps + 1)
     inputs = CriticInputs(window.obs, window.action, window.time_step, window.state_mask)
     next_action, next_log_prob = numpy_sample(

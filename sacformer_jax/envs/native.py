@@ -29,7 +29,7 @@ from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, model_path
 from sacformer_jax.envs.tasks import Quantities, Task
 
-_STATE_SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
+STATE_SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
 # C MuJoCo resets an unstable simulation silently; only these counters tell.
 _BAD_WARNINGS = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
@@ -87,7 +87,7 @@ class _Worker:
         ]
         self.displacement = slices["displacement"]
         self.bad = slices["bad"].start
-        self.num_physics = mujoco.mj_stateSize(model, _STATE_SPEC)
+        self.num_physics = mujoco.mj_stateSize(model, STATE_SPEC)
         self.init_qpos = self.data.qpos.copy()
 
     def _measure_root(self) -> np.ndarray:
@@ -101,14 +101,14 @@ class _Worker:
         return (numerator / self.body_mass.sum())[:2]
 
     def _write(self, state_out: np.ndarray, row: np.ndarray) -> None:
-        mujoco.mj_getState(self.model, self.data, state_out[: self.num_physics], _STATE_SPEC)
+        mujoco.mj_getState(self.model, self.data, state_out[: self.num_physics], STATE_SPEC)
         for view, where in self.outputs:
             row[where] = view.reshape(-1)
 
     def step(self, state: np.ndarray, ctrl: np.ndarray, out: np.ndarray, row: np.ndarray) -> None:
         """Advances ``state`` (float64) into ``out`` and fills ``row`` (float32)."""
         model, data = self.model, self.data
-        mujoco.mj_setState(model, data, state[: self.num_physics], _STATE_SPEC)
+        mujoco.mj_setState(model, data, state[: self.num_physics], STATE_SPEC)
         data.ctrl[:] = ctrl
         self.warnings[:] = _WARNED_BEFORE
         mujoco.mj_step(model, data, nstep=self.frame_skip)
@@ -172,7 +172,7 @@ class NativeEngine:
             shapes[name] = (self.model.nbody, columns) if columns else (self.nv,)
         self._derived = task.derived
         self._layout = _Layout({**shapes, "displacement": (2,), "bad": ()})
-        self._num_state = mujoco.mj_stateSize(self.model, _STATE_SPEC) + 2
+        self._num_state = mujoco.mj_stateSize(self.model, STATE_SPEC) + 2
         self.num_threads = num_threads or usable_cores()
         slices = self._layout.slices()
         self._workers = [_Worker(self.model, task, slices) for _ in range(self.num_threads)]
