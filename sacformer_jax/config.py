@@ -23,6 +23,7 @@ MjxImpl = Literal["jax", "warp"]
 BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
 Tokens = Literal["gs", "gsa"]
 ComputeDtype = Literal["float32", "bfloat16"]
+ActingContext = Literal["window", "episode"]
 CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
@@ -88,7 +89,11 @@ class ContextConfig:
     """What the actor sees."""
 
     context_length: int = 6
-    """K: (return-to-go, state) pairs the actor sees, in acting and in training."""
+    """K: (return-to-go, state) pairs the actor sees, in training and in acting on the window."""
+    acting_context: ActingContext = "window"
+    """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
+    acting_context_limit: int = 1000
+    """Newest pairs seen at most with acting_context=episode."""
     return_conditioning: Conditioning = "hindsight"
     """Return-to-go in training: obtained afterwards, commanded (Eq. 1 as in acting), or none."""
     target_return: float | Literal["auto"] = 5_000.0

@@ -7,17 +7,20 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax.types import Context
+from sacformer_jax.types import Acted, Cache, Context
 
 
-def empty(num_envs: int, context_length: int, obs_size: int, action_size: int) -> Context:
-    """A context without any pair: ``[N, K]``."""
+def empty(
+    num_envs: int, context_length: int, obs_size: int, action_size: int, cache: Cache
+) -> Context:
+    """A context without any pair, ``[N, K]``; ``cache`` as from ``Agent.init_cache``."""
     return Context(
         obs=jnp.zeros((num_envs, context_length, obs_size)),
         action=jnp.zeros((num_envs, context_length, action_size)),
         return_so_far=jnp.zeros((num_envs, context_length)),
         time_step=jnp.zeros((num_envs, context_length), jnp.int32),
         mask=jnp.zeros((num_envs, context_length), bool),
+        cache=cache,
     )
 
 
@@ -36,7 +39,8 @@ def push(
     def append(old: jax.Array, new: jax.Array) -> jax.Array:
         return jnp.concatenate([old[:, 1:], new[:, None]], axis=1)  # [N, K, ...]
 
-    return Context(
+    return dataclasses.replace(
+        context,
         obs=append(context.obs, obs),
         action=append(context.action, jnp.zeros_like(context.action[:, -1])),
         return_so_far=append(context.return_so_far, return_so_far),
@@ -45,38 +49,32 @@ def push(
     )
 
 
-def start(obs: jax.Array, context_length: int, action_size: int) -> Context:
-    """The context at the first state of an episode: ``obs [N, O]``."""
+def start(obs: jax.Array, context_length: int, action_size: int, cache: Cache) -> Context:
+    """The context at the first state of an episode: ``obs [N, O]``; ``cache`` as in `empty`."""
     num_envs, obs_size = obs.shape
     return push(
-        empty(num_envs, context_length, obs_size, action_size),
+        empty(num_envs, context_length, obs_size, action_size, cache),
         obs,
         jnp.zeros(num_envs),
         jnp.zeros(num_envs, jnp.int32),
     )
 
 
-def advance(
-    context: Context,
-    action: jax.Array,
-    next_obs: jax.Array,
-    reward: jax.Array,
-    done: jax.Array,
-) -> Context:
+def advance(acted: Acted, next_obs: jax.Array, reward: jax.Array, done: jax.Array) -> Context:
     """The context after a step: cleared where the episode ended.
 
     Args:
-      context: the context acted on.
-      action: ``[N, A]`` what was done there.
+      acted: the context acted on, and what was done there.
       next_obs: ``[N, O]`` the state to act on next, after the reset where ``done``.
       reward: ``[N]``.
       done: bool ``[N]``.
     """
+    context = acted.context
     return_so_far = jnp.where(done, 0.0, context.return_so_far[:, -1] + reward)
     time_step = jnp.where(done, 0, context.time_step[:, -1] + 1)
     kept = dataclasses.replace(
         context,
-        action=context.action.at[:, -1].set(action),
+        action=context.action.at[:, -1].set(acted.action),
         mask=context.mask & ~done[:, None],
     )
     return push(kept, next_obs, return_so_far, time_step)

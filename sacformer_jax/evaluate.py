@@ -13,6 +13,9 @@ from sacformer_jax.agents.core import Agent
 from sacformer_jax.envs.core import VectorEnv, VectorEnvState
 from sacformer_jax.types import Context, PolicyState
 
+_ACTING_STREAM = 2**31
+"""Folded into the key: beyond the small numbers by which the environments split it."""
+
 
 @flax.struct.dataclass
 class Evaluation:
@@ -31,6 +34,7 @@ class Evaluation:
 class _Progress:
     env: VectorEnvState
     context: Context
+    key: jax.Array
     running: jax.Array
     result: Evaluation
 
@@ -44,14 +48,14 @@ def make_evaluator(
     """
 
     def step(policy: PolicyState, progress: _Progress) -> _Progress:
-        action = agent.act(policy, progress.context, None)
-        env_state, step = env.step(progress.env, action)
+        key, act_key = jax.random.split(progress.key)
+        acted = agent.act(policy, progress.context, act_key, explore=False)
+        env_state, step = env.step(progress.env, acted.action)
         reward = jnp.where(progress.running, step.reward, 0.0)
         return _Progress(
             env=env_state,
-            context=contexts.advance(
-                progress.context, action, step.next_obs, step.reward, step.done
-            ),
+            context=contexts.advance(acted, step.next_obs, step.reward, step.done),
+            key=key,
             running=progress.running & ~step.done,
             result=Evaluation(
                 returns=progress.result.returns + reward,
@@ -62,9 +66,11 @@ def make_evaluator(
     @jax.jit
     def evaluate(policy: PolicyState, key: jax.Array) -> Evaluation:
         env_state = env.init(key)
+        cache = agent.init_cache(env.num_envs)
         progress = _Progress(
             env=env_state,
-            context=contexts.start(env_state.obs, context_length, env.spec.action_size),
+            context=contexts.start(env_state.obs, context_length, env.spec.action_size, cache),
+            key=jax.random.fold_in(key, _ACTING_STREAM),
             running=jnp.ones(env.num_envs, bool),
             result=Evaluation(
                 returns=jnp.zeros(env.num_envs), lengths=jnp.zeros(env.num_envs, jnp.int32)

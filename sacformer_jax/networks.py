@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -97,6 +98,8 @@ class TransformerActor(nn.Module):
       context_length: K; no position attends to more than K pairs.
       max_time_step: size of the time-step embedding.
       head_init_scale: see :class:`GaussianHeads`.
+      cached: act on an episode step by step: keys and values of the K newest steps are kept in
+        the collection ``"cache"`` (which must be mutable) instead of being computed again.
     """
 
     config: TransformerConfig
@@ -105,6 +108,7 @@ class TransformerActor(nn.Module):
     max_time_step: int
     head_init_scale: float
     tokens: Tokens = "gs"
+    cached: bool = False
 
     @nn.compact
     def __call__(
@@ -116,23 +120,39 @@ class TransformerActor(nn.Module):
         state_mask: jax.Array,
         deterministic: bool = True,
     ) -> GaussianParams:
-        """Action distributions at every state.
+        """Action distributions at every state; with a cache, at the newest one alone.
 
         Args:
           obs: ``[B, T, O]``, normalized.
           action: ``[B, T, A]``, the actions taken; each is seen from the next state on, the last
             one by nobody, and none at all with ``tokens="gs"``.
           return_to_go: ``[B, T]``, scaled.
-          time_step: int32 ``[B, T]``.
-          state_mask: bool ``[B, T]``, real pairs.
+          time_step: int32 ``[B, T]``; with a cache, each call must be one step after the one
+            before, or 0, where the cache starts anew.
+          state_mask: bool ``[B, T]``, real pairs; with a cache, the time step tells.
           deterministic: dropout off; otherwise the rng ``dropout`` is used.
 
         Returns:
-          mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing.
+          mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing. With a
+          cache ``[B, 1, A]``.
         """
         step = {"return": return_to_go[..., None], "state": obs}
         if self.tokens == "gsa":
             step["action"] = action
+        if self.cached:
+            features = self._newest_features(step, time_step, deterministic)
+        else:
+            features = self._features(step, time_step, state_mask, deterministic)
+        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+
+    def _features(
+        self,
+        step: dict[str, jax.Array],
+        time_step: jax.Array,
+        state_mask: jax.Array,
+        deterministic: bool,
+    ) -> jax.Array:
+        """What the trunk makes of the state tokens, ``[B, T, D]``."""
         n, states = len(step), time_step.shape[1]
         tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)
 
@@ -141,10 +161,57 @@ class TransformerActor(nn.Module):
         token_mask = jnp.repeat(jnp.repeat(step_mask, n, axis=1), n, axis=2)  # [B, nT, nT]
         token_mask &= jnp.tril(jnp.ones((n * states, n * states), bool))
         # State tokens are the second ones.
-        features = Transformer(self.config, kept=(1, n), name="trunk")(
-            tokens, token_mask, deterministic
-        )
-        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+        trunk = Transformer(self.config, kept=(1, n), name="trunk")
+        return trunk(tokens, token_mask, deterministic)
+
+    def _newest_features(
+        self, step: dict[str, jax.Array], time_step: jax.Array, deterministic: bool
+    ) -> jax.Array:
+        """The same of the newest state token alone, ``[B, 1, D]``, by way of the cache."""
+        n = len(step)
+        # What is new since the last call: the action taken then (if seen), return and state.
+        step = {name: values[:, 1 - n :] for name, values in step.items()}
+        tokens = embed_steps(step, time_step[:, 1 - n :], self.config.width, self.max_time_step)
+        places = cache_places(time_step[:, -1], n, self.context_length)
+        # With actions: (G, S, [A, G, S], A); without: ([G, S]).
+        new_tokens = tokens[:, n * (n - 2) + 2 - n :][:, :n]  # [B, n, D]
+        trunk = Transformer(self.config, kept=(n - 1, n), name="trunk")
+        return trunk(new_tokens, places.mask, deterministic, places.positions)
+
+
+@flax.struct.dataclass
+class CachePlaces:
+    """Where the n newest tokens of a running episode go in the cache, and what they attend to.
+
+    Attributes:
+      positions: int32 ``[B, n]``.
+      mask: bool ``[B, n, C]``.
+    """
+
+    positions: jax.Array
+    mask: jax.Array
+
+
+def cache_places(time_step: jax.Array, num_tokens: int, context_length: int) -> CachePlaces:
+    """The places of an episode's tokens ``(G_0, S_0, [A_0,] G_1, …)`` in a ring.
+
+    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with actions
+    one more, since A_{t-1} comes with step t and sees a step that S_t no longer does.
+
+    Args:
+      time_step: int32 ``[B]``, t of the newest state.
+      num_tokens: n, 2 or 3 a step; the newest are ``G_t, S_t``, after ``A_{t-1}`` with 3.
+      context_length: how many steps a token sees, its own included.
+    """
+    n = num_tokens
+    size = (context_length + n - 2) * n
+    new = time_step[:, None] * n + jnp.arange(2 - n, 2)  # [B, n]
+    newest = new[:, -1:]
+    # The number of the token that lies at each place; below 0 it is none of this episode.
+    held = newest - (newest - jnp.arange(size)) % size  # [B, C]
+    query, key = new[:, :, None], held[:, None, :]
+    visible = (key >= 0) & (key <= query) & (query // n - key // n < context_length)
+    return CachePlaces(positions=new % size, mask=visible)
 
 
 class MLP(nn.Module):

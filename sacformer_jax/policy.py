@@ -15,15 +15,15 @@ from sacformer_jax import context as contexts
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.types import Context, PolicyState
+from sacformer_jax.types import Acted, PolicyState
 
 
 @flax.struct.dataclass
-class Acting:
-    """One step of acting: the context after it, and the action chosen."""
+class _Memory:
+    """What a policy keeps between steps: its last step, and the key of the next."""
 
-    context: Context
-    action: jax.Array
+    last: Acted
+    key: jax.Array
 
 
 class Policy:
@@ -33,7 +33,7 @@ class Policy:
       config: the configuration it was trained with.
       spec: facts of the environment it was trained on.
       state: parameters, normalizer and target return.
-      agent: the algorithm; ``agent.act(state, context, None)`` is the pure acting function.
+      agent: the algorithm; ``agent.act`` is the pure acting function.
 
     Example:
       >>> policy = load_policy("runs/my-run")
@@ -47,18 +47,16 @@ class Policy:
 
     def __init__(self, config: Config, spec: EnvSpec, agent: Agent, state: PolicyState):
         self.config, self.spec, self.agent, self.state = config, spec, agent, state
-        self._act = jax.jit(self._acting)
+        self._act = jax.jit(self._acting, donate_argnums=1)
         self.reset()
 
     def reset(self) -> None:
         """Forgets the episode so far; call it at each ``env.reset()``."""
-        spec = self.spec
-        self._last = Acting(
-            context=contexts.empty(
-                1, self.config.context.context_length, spec.obs_size, spec.action_size
-            ),
-            action=jnp.zeros(spec.action_size),
-        )
+        spec, context_length = self.spec, self.config.context.context_length
+        cache = self.agent.init_cache(1)
+        context = contexts.empty(1, context_length, spec.obs_size, spec.action_size, cache)
+        last = Acted(action=jnp.zeros((1, spec.action_size)), context=context)
+        self._memory = _Memory(last, jax.random.key(0))
         self._first = True
 
     def predict(self, obs: Any, reward: float = 0.0) -> np.ndarray:
@@ -78,25 +76,24 @@ class Policy:
         values = np.asarray(obs, np.float32)
         if values.shape != (self.spec.obs_size,):
             raise ValueError(f"obs of shape {values.shape}: must be ({self.spec.obs_size},)")
-        acting = self._act(
-            self.state, self._last, values, np.float32(reward), np.bool_(self._first)
+        self._memory = self._act(
+            self.state, self._memory, values, np.float32(reward), np.bool_(self._first)
         )
-        self._last, self._first = acting, False
-        return np.array(acting.action)
+        self._first = False
+        return np.array(self._memory.last.action[0])
 
     def _acting(
         self,
         state: PolicyState,
-        last: Acting,
+        memory: _Memory,
         obs: jax.Array,
         reward: jax.Array,
         first: jax.Array,
-    ) -> Acting:
+    ) -> _Memory:
+        key, act_key = jax.random.split(memory.key)
         # An episode's first state enters like one after a reset.
-        context = contexts.advance(
-            last.context, last.action[None], obs[None], reward[None], first[None]
-        )
-        return Acting(context, jnp.asarray(self.agent.act(state, context, None)[0]))
+        context = contexts.advance(memory.last, obs[None], reward[None], first[None])
+        return _Memory(self.agent.act(state, context, act_key, explore=False), key)
 
 
 def load_policy(path: str | Path, which: str = "best") -> Policy:

@@ -64,6 +64,7 @@ PRESETS: dict[str, tuple[Layer, ...]] = {
         *_TARGET_RETURNS,
         Layer("authors' program: alpha 0.05 on Humanoid", {"alpha": 0.05}, env="Humanoid"),
         Layer("authors' program: K = 10 on Humanoid", {"context_length": 10}, env="Humanoid"),
+        Layer("the paper's Algorithm 2", {"acting_context": "episode"}, agent="sacformer"),
         Layer(
             "SAC (arXiv 1812.05905): 2x256, batch 256, tuned temperature",
             {**_SAC_ACTOR, "batch_size": 256, "tune_alpha": True, "alpha": 1.0},

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from sacformer_jax import context as contexts
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.envs.core import VectorEnv, VectorEnvState
-from sacformer_jax.types import BufferState, Context, Transition
+from sacformer_jax.types import Acted, BufferState, Cache, Context, Transition
 
 
 @flax.struct.dataclass
@@ -52,16 +52,16 @@ class RolloutStats:
         )
 
 
-ChooseAction = Callable[[Context, jax.Array], jax.Array]
-"""``(context, key) -> action [N, A]``."""
+ChooseAction = Callable[[Context, jax.Array], Acted]
+"""``(context, key) -> Acted``."""
 
 
-def start(env: VectorEnv, buffer: TrajectoryBuffer, key: jax.Array) -> RolloutState:
-    """N fresh episodes and an empty replay."""
+def start(env: VectorEnv, buffer: TrajectoryBuffer, cache: Cache, key: jax.Array) -> RolloutState:
+    """N fresh episodes and an empty replay; ``cache`` is the agent's for N contexts."""
     env_state = env.init(key)
     return RolloutState(
         env=env_state,
-        context=contexts.start(env_state.obs, buffer.context_length, buffer.action_size),
+        context=contexts.start(env_state.obs, buffer.context_length, buffer.action_size, cache),
         buffer=buffer.init(),
     )
 
@@ -83,12 +83,12 @@ def collect(
     def one_step(
         state: RolloutState, key: jax.Array
     ) -> tuple[RolloutState, tuple[RolloutStats, jax.Array]]:
-        context = state.context
-        action = choose_action(context, key)
-        env_state, step = env.step(state.env, action)
+        acted = choose_action(state.context, key)
+        context = acted.context
+        env_state, step = env.step(state.env, acted.action)
         transition = Transition(
             obs=context.obs[:, -1],
-            action=action,
+            action=acted.action,
             reward=step.reward,
             terminated=step.terminated,
             truncated=step.truncated,
@@ -106,7 +106,7 @@ def collect(
         )
         next_state = RolloutState(
             env=env_state,
-            context=contexts.advance(context, action, step.next_obs, step.reward, step.done),
+            context=contexts.advance(acted, step.next_obs, step.reward, step.done),
             buffer=buffer.add(state.buffer, transition),
         )
         return next_state, (stats, transition.obs)

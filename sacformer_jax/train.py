@@ -19,6 +19,7 @@ from sacformer_jax.config import Config
 from sacformer_jax.envs import VectorEnv, make_env
 from sacformer_jax.rollout import RolloutState, RolloutStats
 from sacformer_jax.types import (
+    Acted,
     Context,
     Counters,
     Hyperparameters,
@@ -139,7 +140,8 @@ class _TrainingFunctions:
 
     def init(self, key: jax.Array) -> TrainState:
         key, learner_key, env_key = jax.random.split(key, 3)
-        start = rollout.start(self.env, self.buffer, env_key)
+        cache = self.agent.init_cache(self.env.num_envs)
+        start = rollout.start(self.env, self.buffer, cache, env_key)
         zero = jnp.zeros((), jnp.int32)
         return TrainState(
             learner=self.agent.init(learner_key),
@@ -152,8 +154,12 @@ class _TrainingFunctions:
         )
 
     def prefill(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        def random_action(context: Context, key: jax.Array) -> jax.Array:
-            return self.env.random_action(key)
+        def random_action(context: Context, key: jax.Array) -> Acted:
+            if self.config.context.acting_context == "episode":
+                # The policy looks on, so that it knows the episodes that it will go on with.
+                policy, look_key = policy_of(state), jax.random.fold_in(key, 1)
+                context = self.agent.act(policy, context, look_key, explore=False).context
+            return Acted(self.env.random_action(key), context)
 
         state, stats = self._collect(state, random_action, self.config.prefill_vector_steps)
         return state, _episode_metrics(stats)
@@ -173,8 +179,8 @@ class _TrainingFunctions:
         num_steps, num_updates = self.config.steps_and_updates
         policy = policy_of(state)
 
-        def choose_action(context: Context, key: jax.Array) -> jax.Array:
-            return self.agent.act(policy, context, key)
+        def choose_action(context: Context, key: jax.Array) -> Acted:
+            return self.agent.act(policy, context, key, explore=True)
 
         state, stats = self._collect(state, choose_action, num_steps)
 

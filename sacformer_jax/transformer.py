@@ -1,6 +1,6 @@
 """A causal pre-LayerNorm GPT-2 trunk. Nothing about reinforcement learning is in it.
 
-Letters: B sequences, T tokens, S query tokens, H heads, D width.
+Letters: B sequences, T tokens, S query tokens, C tokens in the cache, H heads, D width.
 """
 
 from __future__ import annotations
@@ -66,8 +66,14 @@ class Block(nn.Module):
     kept: tuple[int, int] = EVERY_TOKEN
 
     @nn.compact
-    def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool) -> jax.Array:
-        """``x [B, T, D]``, ``mask [B, T, T]`` (query, key) -> ``[B, S, D]``."""
+    def __call__(
+        self,
+        x: jax.Array,
+        mask: jax.Array,
+        deterministic: bool,
+        positions: jax.Array | None = None,
+    ) -> jax.Array:
+        """``x [B, T, D]`` -> ``[B, S, D]``; see :class:`Transformer` for the arguments."""
         cfg = self.config
         batch, _, width = x.shape
         head_width = width // cfg.heads
@@ -92,6 +98,9 @@ class Block(nn.Module):
             return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
 
         q, k, v = split_heads(q), split_heads(k), split_heads(v)
+        if positions is not None:
+            k = self._cached("key", k, positions, mask.shape[-1])  # [B, H, C, D/H]
+            v = self._cached("value", v, positions, mask.shape[-1])
         scores = jnp.einsum("bhsd,bhtd->bhst", q, k).astype(jnp.float32) / jnp.sqrt(head_width)
         weights = jax.nn.softmax(jnp.where(mask[:, None], scores, _MASKED), axis=-1)
         weights = dropout(weights, deterministic).astype(v.dtype)
@@ -102,6 +111,15 @@ class Block(nn.Module):
         hidden = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_2")(x)
         hidden = ACTIVATIONS[cfg.activation](project(cfg.mlp_ratio * width, "mlp_in")(hidden))
         return x + dropout(project(width, "mlp_out")(hidden), deterministic)
+
+    def _cached(self, name: str, new: jax.Array, positions: jax.Array, size: int) -> jax.Array:
+        """Writes ``new [B, H, T, D/H]`` into the cache; all of it, ``[B, H, C, D/H]``."""
+        batch, heads, _, head_width = new.shape
+        cache = self.variable("cache", name, jnp.zeros, (batch, heads, size, head_width), new.dtype)
+        rows = jnp.arange(batch)[:, None]  # [B, 1]
+        # The indexed axes come first, so the values are laid out as [B, T, H, D/H].
+        cache.value = cache.value.at[rows, :, positions].set(new.swapaxes(1, 2))
+        return cache.value
 
 
 class Transformer(nn.Module):
@@ -116,14 +134,23 @@ class Transformer(nn.Module):
     kept: tuple[int, int] = EVERY_TOKEN
 
     @nn.compact
-    def __call__(self, x: jax.Array, mask: jax.Array, deterministic: bool = True) -> jax.Array:
-        """Runs the trunk.
+    def __call__(
+        self,
+        x: jax.Array,
+        mask: jax.Array,
+        deterministic: bool = True,
+        positions: jax.Array | None = None,
+    ) -> jax.Array:
+        """Runs the trunk, on whole sequences or on the newest tokens of longer ones.
 
         Args:
           x: ``[B, T, D]`` embedded tokens.
           mask: bool ``[B, T, T]``, whether a query (axis 1) may attend to a key (axis 2); every
-            query must have at least one.
+            query must have at least one. ``[B, T, C]`` with a cache.
           deterministic: dropout off.
+          positions: int32 ``[B, T]``, where the keys and values of these tokens go in the
+            collection ``"cache"``, which must be mutable; queries then attend to the C places of
+            the cache instead of to ``x``. None: no cache.
 
         Returns:
           ``[B, S, D]``, the kept tokens.
@@ -132,7 +159,7 @@ class Transformer(nn.Module):
         for i in range(self.config.layers):
             last = i == self.config.layers - 1
             block = Block(self.config, self.kept if last else EVERY_TOKEN, name=f"block_{i}")
-            x = block(x, mask, deterministic)
+            x = block(x, mask, deterministic, positions)
         return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_f")(x)
 
 

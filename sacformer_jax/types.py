@@ -14,6 +14,7 @@ import jax
 from sacformer_jax.envs.core import VectorEnvState
 
 Params = Any
+Cache = Any
 
 
 @flax.struct.dataclass
@@ -28,6 +29,9 @@ class Context:
       return_so_far: ``[N, K]`` reward collected in the episode before that state.
       time_step: int32 ``[N, K]`` steps taken in the episode before that state.
       mask: bool ``[N, K]`` whether the pair exists.
+      cache: with ``acting_context="episode"``, the keys and values of the episode's tokens up to
+        the pair before the newest, ``[N, ...]``; otherwise empty. It needs no clearing: the time
+        step tells what belongs to the running episode.
     """
 
     obs: jax.Array
@@ -35,6 +39,20 @@ class Context:
     return_so_far: jax.Array
     time_step: jax.Array
     mask: jax.Array
+    cache: Cache
+
+
+@flax.struct.dataclass
+class Acted:
+    """What an agent did at the newest pair of each context.
+
+    Attributes:
+      action: ``[N, A]``.
+      context: the context it acted on, whose cache now holds that pair too.
+    """
+
+    action: jax.Array
+    context: Context
 
 
 @flax.struct.dataclass

@@ -10,7 +10,7 @@ _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width", "critic_heads",
+    "critic_width", "critic_heads", "acting_context_limit",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
@@ -46,6 +46,7 @@ def check(config: Config) -> None:
     _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
     _check_actor(config)
     _check_target_return(config)
+    _check_acting(config)
     _check_critic(config)
     _check_steps(config)
 
@@ -90,6 +91,23 @@ def _check_target_return(config: Config) -> None:
         context.target_return != "auto" or context.return_conditioning != "none",
         "target_return='auto': return_conditioning=none looks at no return; use hindsight or "
         "commanded",
+    )
+
+
+def _check_acting(config: Config) -> None:
+    context = config.context
+    if context.acting_context == "window":
+        return
+    _require(
+        config.agent != "sac",
+        f"acting_context={context.acting_context!r}: agent=sac sees one state; use "
+        "acting_context=window, or agent=sacformer",
+    )
+    _require(
+        context.acting_context_limit >= context.context_length,
+        f"acting_context_limit={context.acting_context_limit}: is below "
+        f"context_length={context.context_length}, what training shows; use "
+        f"{context.context_length} or more",
     )
 
 

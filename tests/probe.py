@@ -58,6 +58,7 @@ def point_config(**fields: object) -> Config:
         "buffer_capacity": 8_000,
         "batch_size": 32,
         "context_length": 2,
+        "acting_context": "window",
         "actor_layers": 1,
         "actor_width": 16,
         "actor_heads": 1,

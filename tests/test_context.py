@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from sacformer_jax import context as contexts
+from sacformer_jax.types import Acted
 
 
 def test_context_keeps_the_last_k_pairs_and_clears_at_a_reset():
     # Two environments; the second one's episode ends at the second step.
-    context = contexts.start(jnp.array([[10.0], [20.0]]), 3, action_size=1)
+    context = contexts.start(jnp.array([[10.0], [20.0]]), 3, action_size=1, cache={})
     assert context.mask.tolist() == [[False, False, True]] * 2
     assert context.obs[:, -1, 0].tolist() == [10.0, 20.0]
     steps = [
@@ -20,7 +21,8 @@ def test_context_keeps_the_last_k_pairs_and_clears_at_a_reset():
         ([[0.3], [0.6]], [[13.0], [91.0]], [3.0, 7.0], [False, False]),
     ]
     for step in steps:
-        context = jax.jit(contexts.advance)(context, *map(jnp.array, step))
+        action, *rest = map(jnp.array, step)
+        context = jax.jit(contexts.advance)(Acted(action, context), *rest)
     assert context.obs[..., 0].tolist() == [[11.0, 12.0, 13.0], [21.0, 90.0, 91.0]]
     # An action stands beside the state it was done in; the newest is still to come.
     np.testing.assert_allclose(context.action[0, :, 0], [0.2, 0.3, 0.0])

@@ -341,7 +341,8 @@ def _context_by_hand(
         mask[0, place] = True
         if step < steps - 1:  # the newest is still to come
             action[0, place] = actions[step]
-    return Context(*(jnp.asarray(x) for x in (obs, action, return_so_far, time_step, mask)))
+    arrays = (jnp.asarray(x) for x in (obs, action, return_so_far, time_step, mask))
+    return Context(*arrays, cache={})
 
 
 @pytest.mark.parametrize("tokens", ["gs", "gsa"])
@@ -352,7 +353,8 @@ def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, tokens: s
         learner = agent.init(jax.random.key(0))
         state = policy_state(learner, hyperparameters(config, 3))
         policy = Policy(config, policy.spec, agent, state)
-    act = jax.jit(lambda state, context: policy.agent.act(state, context, None))
+    agent, key = policy.agent, jax.random.key(0)
+    act = jax.jit(lambda state, context: agent.act(state, context, key, explore=False).action)
     for steps in (1, 3, 6, 8):  # K is 6
         observations, rewards = _observations(steps), np.arange(1, steps + 1, dtype=np.float32)
         actions = _predictions(policy, observations, rewards)

@@ -7,17 +7,28 @@ from typing import Protocol
 
 import jax
 
-from sacformer_jax.types import Context, Hyperparameters, LearnerState, PolicyState, Window
+from sacformer_jax.types import (
+    Acted,
+    Cache,
+    Context,
+    Hyperparameters,
+    LearnerState,
+    PolicyState,
+    Window,
+)
 
 Metrics = dict[str, jax.Array]
 
 
 class Act(Protocol):
-    """``act(policy, context, key) -> action [N, A]``; the mean action where ``key`` is None."""
+    """``act(policy, context, key, explore) -> Acted``: a random action, or the mean one.
+
+    ``explore`` is static. Without it the key matters only where dropout is on in acting.
+    """
 
     def __call__(
-        self, policy: PolicyState, context: Context, key: jax.Array | None
-    ) -> jax.Array: ...
+        self, policy: PolicyState, context: Context, key: jax.Array, explore: bool
+    ) -> Acted: ...
 
 
 class Update(Protocol):
@@ -34,16 +45,24 @@ class Init(Protocol):
     def __call__(self, key: jax.Array) -> LearnerState: ...
 
 
+class InitCache(Protocol):
+    """``init_cache(num_envs) -> cache``: of contexts at the start of their episodes."""
+
+    def __call__(self, num_envs: int) -> Cache: ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Agent:
-    """An algorithm as three pure functions.
+    """An algorithm as pure functions.
 
     Attributes:
       init: makes the learner state.
+      init_cache: makes what a context keeps of its whole episode; empty where that is nothing.
       act: chooses actions from contexts.
       update: one gradient update on a batch of windows.
     """
 
     init: Init
+    init_cache: InitCache
     act: Act
     update: Update

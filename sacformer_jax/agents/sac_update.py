@@ -22,6 +22,8 @@ from sacformer_jax.distributions import TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import GaussianParams, max_time_step
 from sacformer_jax.types import (
+    Acted,
+    Cache,
     Context,
     Hyperparameters,
     LearnerState,
@@ -37,6 +39,7 @@ class SACParts:
 
     Attributes:
       actor: network of the signature of :class:`~sacformer_jax.networks.TransformerActor`.
+      acting_actor: the same network, as it acts: with a cache or without.
       critics: twin critics over windows.
       distribution: the policy's distribution over the action bounds.
       obs_size: O.
@@ -49,6 +52,7 @@ class SACParts:
     """
 
     actor: nn.Module
+    acting_actor: nn.Module
     critics: TwinCritics
     distribution: TanhGaussian
     obs_size: int
@@ -60,10 +64,13 @@ class SACParts:
     normalize_obs: bool
 
 
-def sac_parts(config: Config, spec: EnvSpec, actor: nn.Module) -> SACParts:
+def sac_parts(
+    config: Config, spec: EnvSpec, actor: nn.Module, acting_actor: nn.Module | None = None
+) -> SACParts:
     """The parts that a configuration and an environment ask for, around ``actor``."""
     return SACParts(
         actor=actor,
+        acting_actor=acting_actor or actor,
         critics=make_critics(
             config.critic,
             config.precision.compute_dtype,
@@ -114,6 +121,8 @@ def make_sac_agent(parts: SACParts) -> Agent:
     """Binds the parts to the shared SAC functions."""
     actor, critics, distribution = parts.actor, parts.critics, parts.distribution
     apply_actor: Callable[..., GaussianParams] = actor.apply  # type: ignore[assignment]
+    apply_acting: Callable[..., tuple[GaussianParams, Params]]
+    apply_acting = parts.acting_actor.apply
     adam = optax.scale_by_adam()
 
     def apply_adam(
@@ -170,24 +179,40 @@ def make_sac_agent(parts: SACParts) -> Agent:
             normalizer=normalizer.init(parts.obs_size),
         )
 
-    def act(policy: PolicyState, context: Context, key: jax.Array | None) -> jax.Array:
+    def init_cache(num_envs: int) -> Cache:
+        pairs = (num_envs, parts.context_length)
+        variables = jax.eval_shape(
+            parts.acting_actor.init,
+            jax.random.key(0),
+            jnp.zeros((*pairs, parts.obs_size)),
+            jnp.zeros((*pairs, parts.action_size)),
+            jnp.zeros(pairs),
+            jnp.zeros(pairs, jnp.int32),
+            jnp.ones(pairs, bool),
+        )
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), variables.get("cache", {}))
+
+    def act(policy: PolicyState, context: Context, key: jax.Array, explore: bool) -> Acted:
         return_to_go = commanded_return_to_go(
             context.return_so_far, policy.target_return, policy.return_scale
         )
         if parts.return_conditioning == "none":
             return_to_go = jnp.zeros_like(return_to_go)
-        gaussian = apply_actor(
-            policy.actor_params,
+        gaussian, changed = apply_acting(
+            {**policy.actor_params, "cache": context.cache},
             prepare_obs(policy, context.obs),
             context.action,
             return_to_go,
             context.time_step,
             context.mask,
+            mutable=["cache"],
         )
         mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
-        if key is None:
-            return distribution.mode(mean)
-        return distribution.sample_and_log_prob(key, mean, log_std)[0]
+        if explore:
+            action = distribution.sample_and_log_prob(key, mean, log_std)[0]
+        else:
+            action = distribution.mode(mean)
+        return Acted(action, dataclasses.replace(context, cache=changed.get("cache", {})))
 
     def update(
         learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
@@ -285,4 +310,4 @@ def make_sac_agent(parts: SACParts) -> Agent:
         }
         return new_learner, metrics
 
-    return Agent(init=init, act=act, update=update)
+    return Agent(init=init, init_cache=init_cache, act=act, update=update)

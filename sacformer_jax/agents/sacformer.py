@@ -29,4 +29,8 @@ def make(config: Config, spec: EnvSpec) -> Agent:
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
     )
-    return make_sac_agent(sac_parts(config, spec, actor))
+    acting_actor = actor
+    if config.context.acting_context == "episode":
+        limit = min(config.context.acting_context_limit, spec.max_episode_steps)
+        acting_actor = actor.clone(context_length=limit, cached=True)
+    return make_sac_agent(sac_parts(config, spec, actor, acting_actor))

@@ -1,0 +1,252 @@
+"""Acting on the whole episode through the key-value cache equals computing all of it again."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gpt2 import randomized
+from probe import EPISODE, PointEnv, point_config, point_env
+
+from sacformer_jax import agents, rollout
+from sacformer_jax import context as contexts
+from sacformer_jax.config import Config, ConfigError
+from sacformer_jax.context import commanded_return_to_go
+from sacformer_jax.envs.core import EnvSpec, VectorEnv
+from sacformer_jax.evaluate import make_evaluator
+from sacformer_jax.networks import TransformerActor, cache_places
+from sacformer_jax.policy import Policy
+from sacformer_jax.train import hyperparameters, make_program, policy_of, policy_state
+from sacformer_jax.transformer import TransformerConfig
+from sacformer_jax.types import Acted
+
+OBS, ACT, ENVS = 3, 2, 2
+
+
+@pytest.mark.parametrize("num_tokens", [2, 3])
+@pytest.mark.parametrize("band", [1, 3, 20])
+def test_places_in_the_ring_by_simulation(num_tokens, band):
+    """A ring kept token by token in Python, over two episodes of one environment."""
+    n, size = num_tokens, (band + num_tokens - 2) * num_tokens
+    ring = [None] * size  # (episode, step, kind) at each place
+    order = {"G": 0, "S": 1, "A": 2}
+    for episode, length in enumerate((11, 9)):
+        for t in range(length):
+            places = cache_places(jnp.array([t]), n, band)
+            positions, mask = np.asarray(places.positions)[0], np.asarray(places.mask)[0]
+            new = [(t, "G"), (t, "S")] if n == 2 else [(t - 1, "A"), (t, "G"), (t, "S")]
+            for place, (step, kind) in zip(positions, new, strict=True):
+                ring[place] = (episode, step, kind)
+            for row, (step, kind) in enumerate(new):
+                if step < 0:  # an action before the first state: nobody's
+                    continue
+                seen = {token for place, token in enumerate(ring) if mask[row, place]}
+                expected = {
+                    (episode, s, k)
+                    for s in range(max(0, step - band + 1), step + 1)
+                    for k in "GSA"[:n]
+                    if s < step or order[k] <= order[kind]
+                }
+                assert seen == expected, (t, kind)
+
+
+def acting_config(**fields) -> Config:
+    settings = {
+        "context_length": 4,
+        "actor_layers": 2,
+        "actor_width": 16,
+        "actor_heads": 2,
+        "normalize_obs": True,
+        "acting_context": "episode",
+        "target_return": 500.0,
+        "return_scale": 100.0,
+        "head_init_scale": 1.0,
+    }
+    return Config.from_preset("paper", **{**settings, **fields})
+
+
+def make_agent(config: Config, episode_steps: int):
+    """An agent, and a policy whose parameters and normalizer are far from their start."""
+    spec = EnvSpec("test", OBS, ACT, (-2.0, -1.0), (1.0, 3.0), episode_steps, "jax", "a test")
+    agent = agents.make(config, spec)
+    learner = agent.init(jax.random.key(0))
+    normalizer = dataclasses.replace(
+        learner.normalizer,
+        count=jnp.int32(10),
+        mean=jnp.array([0.1, -0.2, 0.3]),
+        m2=jnp.array([20.0, 5.0, 10.0]),
+    )
+    params = randomized(learner.actor_params, scale=0.3)
+    learner = dataclasses.replace(learner, actor_params=params, normalizer=normalizer)
+    return agent, spec, policy_state(learner, hyperparameters(config, ACT))
+
+
+def all_at_once(config, spec, policy, obs, actions, rewards, band):
+    """Mean actions ``[L, A]`` of one episode by a single pass over all of it: no cache."""
+    settings = config.actor
+    actor = TransformerActor(
+        TransformerConfig(settings.actor_layers, settings.actor_width, settings.actor_heads, 4, 0.0,
+                          settings.actor_activation),
+        ACT, band, spec.max_episode_steps + 1, 1.0, config.context.tokens,
+    )  # fmt: skip
+    steps = len(obs)
+    so_far = np.concatenate([[0.0], np.cumsum(rewards[: steps - 1], dtype=np.float32)])
+    count = int(policy.normalizer.count)
+    std = np.sqrt(np.asarray(policy.normalizer.m2) / count)
+    gaussian = jax.jit(actor.apply)(
+        policy.actor_params,
+        jnp.asarray(np.clip((obs - policy.normalizer.mean) / std, -10, 10))[None],
+        jnp.asarray(actions)[None],
+        commanded_return_to_go(so_far, policy.target_return, policy.return_scale)[None],
+        jnp.arange(steps)[None],
+        jnp.ones((1, steps), bool),
+    )
+    low, high = np.array(spec.action_low), np.array(spec.action_high)
+    return (low + high) / 2 + (high - low) / 2 * np.tanh(np.asarray(gaussian.mean[0]))
+
+
+@pytest.mark.parametrize(("tokens", "limit"), [("gs", 1000), ("gsa", 1000), ("gsa", 100)])
+def test_a_thousand_steps_equal_full_recomputation(tokens, limit):
+    """Two environments whose episodes end at different steps; explored actions in the tokens."""
+    config = acting_config(tokens=tokens, acting_context_limit=limit)
+    agent, spec, policy = make_agent(config, 1000)
+    steps, ends = 1_100, {(0, 999), (1, 37), (1, 600)}
+    rng = np.random.default_rng(0)
+    obs = rng.normal(size=(steps, ENVS, OBS)).astype(np.float32)
+    reward = rng.normal(1.0, 2.0, (steps, ENVS)).astype(np.float32)
+    noise = rng.uniform(-1, 1, (steps, ENVS, ACT)).astype(np.float32)
+    done = np.array([[(env, t) in ends for env in range(ENVS)] for t in range(steps)])
+
+    def step(context, inputs):
+        acted = agent.act(policy, context, jax.random.key(0), explore=False)
+        done_there = Acted(inputs["noise"], acted.context)
+        context = contexts.advance(done_there, inputs["next_obs"], inputs["reward"], inputs["done"])
+        return context, acted.action
+
+    start = contexts.start(obs[0], 4, ACT, agent.init_cache(ENVS))
+    inputs = {"noise": noise[:-1], "next_obs": obs[1:], "reward": reward[:-1], "done": done[:-1]}
+    _, mean_actions = jax.jit(lambda start: jax.lax.scan(step, start, inputs))(start)
+    for env in range(ENVS):
+        bounds = [0, *(t + 1 for e, t in sorted(ends) if e == env), steps - 1]
+        for first, last in itertools.pairwise(bounds):
+            part = slice(first, last)
+            expected = all_at_once(
+                config, spec, policy, obs[part, env], noise[part, env], reward[part, env], limit
+            )
+            np.testing.assert_allclose(mean_actions[part, env], expected, atol=1e-5)
+            # It is no matter of course: a context of K tells another story.
+            short = all_at_once(
+                config, spec, policy, obs[part, env], noise[part, env], reward[part, env], 4
+            )
+            assert np.abs(short - expected).max() > 0.01
+
+
+def test_the_cache_holds_the_episode_and_no_more():
+    agent, _, _ = make_agent(acting_config(), 30)
+    shapes = {x.shape for x in jax.tree.leaves(agent.init_cache(5))}
+    assert shapes == {(5, 2, 60, 8)}  # N, heads, two tokens a step, width of a head
+    agent, _, _ = make_agent(acting_config(acting_context_limit=10, tokens="gsa"), 30)
+    assert {x.shape for x in jax.tree.leaves(agent.init_cache(5))} == {(5, 2, 33, 8)}
+    agent, _, _ = make_agent(acting_config(acting_context="window"), 30)
+    assert jax.tree.leaves(agent.init_cache(5)) == []
+
+
+def test_a_policy_object_acts_on_its_whole_episode():
+    config = acting_config(tokens="gsa")
+    agent, spec, state = make_agent(config, 60)
+    policy = Policy(config, spec, agent, state)
+    rng = np.random.default_rng(1)
+    for steps in (60, 25):  # the second episode must know nothing of the first
+        obs = rng.normal(size=(steps, OBS)).astype(np.float32)
+        rewards = rng.normal(size=steps).astype(np.float32)
+        policy.reset()
+        actions = np.stack(
+            [policy.predict(obs[t], rewards[t - 1] if t else 0.0) for t in range(steps)]
+        )
+        expected = all_at_once(config, spec, state, obs, actions, rewards, 60)
+        np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+class HurriedEnv(PointEnv):
+    """Terminates near the origin, so that episodes differ in length."""
+
+    def step(self, state, action):
+        state, step = super().step(state, action)
+        return state, dataclasses.replace(step, terminated=jnp.abs(state[0]) < 0.3)
+
+
+@pytest.fixture(scope="module")
+def program():
+    config = point_config(acting_context="episode", actor_layers=2, tokens="gsa")
+    return make_program(config, VectorEnv(HurriedEnv(), 4))
+
+
+def test_in_training_the_policy_acts_on_the_episode_from_before_it_took_over(program):
+    """Prefill, then collecting with the same parameters: what the replay holds tells the rest."""
+    state, _ = program.prefill(program.init(jax.random.key(3)))
+    prefilled = int(state.buffer.size)
+    policy = policy_of(state)
+    taken_over, _, _ = jax.jit(
+        lambda start: rollout.collect(
+            program.env,
+            program.buffer,
+            lambda context, key: program.agent.act(policy, context, key, explore=False),
+            start,
+            jax.random.key(1),
+            15,
+        )
+    )(rollout.RolloutState(state.env, state.context, state.buffer))
+    steps = jax.tree.map(np.asarray, taken_over.buffer.steps)
+    actor = TransformerActor(
+        TransformerConfig(2, 16, 1, 4, 0.0, "relu"), 1, EPISODE, EPISODE + 1, 0.01, "gsa"
+    )
+    apply, scale = jax.jit(actor.apply), float(policy.return_scale)
+    checked = continued = 0
+    for env in range(4):
+        for now in range(prefilled, prefilled + 15):
+            first = now - steps.time_step[env, now]
+            part = np.minimum(np.arange(first, first + EPISODE), now)[None]  # its end repeated
+            gaussian = apply(
+                policy.actor_params,
+                steps.obs[env, part],
+                steps.action[env, part],
+                (float(policy.target_return) - steps.return_so_far[env, part]) / scale,
+                steps.time_step[env, part],
+                np.ones((1, EPISODE), bool),
+            )
+            expected = np.tanh(gaussian.mean[0, now - first])
+            np.testing.assert_allclose(steps.action[env, now], expected, atol=1e-5)
+            checked += 1
+            continued += first < prefilled
+    assert checked == 60
+    assert 10 < continued < 60
+
+
+def test_it_trains_and_repeats(program):
+    def trained():
+        state, _ = program.prefill(program.init(jax.random.key(0)))
+        state, metrics = program.train_chunk(state)
+        assert np.isfinite(metrics["critic_loss"])
+        evaluate = make_evaluator(point_env(3), program.agent, 2)
+        return evaluate(policy_of(state), jax.random.key(0)).returns
+
+    np.testing.assert_array_equal(trained(), trained())
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"agent": "sac"}, "acting_context='episode': agent=sac sees one state"),
+        ({"acting_context_limit": 3}, "acting_context_limit=3: is below context_length=4"),
+        ({"acting_context_limit": 0}, "acting_context_limit=0: must be at least 1"),
+        ({"acting_context": "whole"}, "acting_context='whole': must be one of window, episode"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(fields, message):
+    sac = {"context_length": 1, "return_conditioning": "none"} if "agent" in fields else {}
+    with pytest.raises(ConfigError, match=message):
+        acting_config(**{**sac, **fields}).validated()
