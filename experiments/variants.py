@@ -1,6 +1,7 @@
 """Every option of the method by itself: preset `cpu` with smaller networks and one thing changed.
 
-A check that all of them run and learn, on two tasks with two seeds; no verdict on any.
+Beside them the presets `paper` and `authors` at the same sizes. A check that all of them run and
+learn, on two tasks with two seeds; no verdict on any.
 
 python experiments/variants.py --jobs 2
 """
@@ -16,6 +17,16 @@ from study import Study
 from sacformer_jax import Config
 
 SMALL: dict[str, Any] = {"total_env_steps": 50_000, "actor_width": 32, "critic_width": 128}
+# What `cpu` sets for speed, for the other presets.
+LIKE_CPU: dict[str, Any] = {
+    "num_envs": 8,
+    "prefill_env_steps": 10_000,
+    "eval_every": 4_000,
+    "buffer_capacity": 200_000,
+    "batch_size": 32,
+    "updates_per_env_step": 0.5,
+    "actor_layers": 2,
+}
 VARIANTS: dict[str, dict[str, Any]] = {
     "cpu": {},
     "hindsight": {"return_conditioning": "hindsight", "prefill_env_steps": 8_000},
@@ -27,6 +38,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "gelu": {"actor_activation": "gelu"},
     "dropout": {"actor_dropout": 0.1},
     "bfloat16": {"compute_dtype": "bfloat16"},
+    "acting-episode": {"acting_context": "episode"},
+    "scattered": {"window": "scattered", "prefill_env_steps": 8_000},
+    "deterministic": {"policy": "deterministic", "tune_alpha": False},
+    "paper": {"preset": "paper", **LIKE_CPU},
+    "authors": {"preset": "authors", **LIKE_CPU},
 }
 TASKS = ("HalfCheetah", "Hopper")
 SEEDS = (0, 1)
@@ -36,7 +52,7 @@ def study() -> Study:
     """All its runs."""
     configs = {
         f"{task}-{variant}-{seed}": Config.from_preset(
-            "cpu", env=task, seed=seed, **{**SMALL, **changes}
+            **{"preset": "cpu", "env": task, "seed": seed, **SMALL, **changes}
         )
         for seed, task, (variant, changes) in itertools.product(SEEDS, TASKS, VARIANTS.items())
     }

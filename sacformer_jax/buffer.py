@@ -4,6 +4,9 @@ Each observation is stored once: the successor of a step is the next ring entry.
 by a uniformly random stored step (the anchor) and a uniformly random place for it among the K
 slots, so windows overhang both ends of an episode. A window with ``n`` steps in it can then be
 drawn through ``n`` anchors; its weight 1/n makes the expected weight of all stored steps equal.
+
+Scattered windows, as the authors' program draws them, are K different steps of one finished
+episode, in order; episodes are drawn uniformly, so steps of short ones more often.
 """
 
 from __future__ import annotations
@@ -13,9 +16,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax import episodes
 from sacformer_jax.config import ConfigError
-from sacformer_jax.context import discounted_suffix_sums
-from sacformer_jax.types import BufferState, Transition, Window
+from sacformer_jax.context import all_discounted_suffix_sums, discounted_suffix_sums
+from sacformer_jax.types import BufferState, States, Transition, Window
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +35,7 @@ class TrajectoryBuffer:
       max_episode_steps: longest episode.
       hindsight: whether windows carry hindsight return-to-go; then only steps of finished
         episodes are drawn.
+      scattered: whether windows are scattered instead of contiguous.
 
     Raises:
       ConfigError: a column cannot hold the longest episode plus a window.
@@ -43,6 +48,7 @@ class TrajectoryBuffer:
     context_length: int
     max_episode_steps: int
     hindsight: bool = False
+    scattered: bool = False
 
     def __post_init__(self) -> None:
         needed = self.max_episode_steps + self.context_length
@@ -70,6 +76,9 @@ class TrajectoryBuffer:
             head=jnp.zeros((), jnp.int32),
             size=jnp.zeros((), jnp.int32),
             running=jnp.zeros(self.num_envs, jnp.int32),
+            episodes=episodes.init(self.num_envs, self.length, self.context_length)
+            if self.scattered
+            else None,
         )
 
     def add(self, state: BufferState, step: Transition) -> BufferState:
@@ -79,27 +88,33 @@ class TrajectoryBuffer:
             return jax.lax.dynamic_update_slice_in_dim(ring, new[:, None], state.head, axis=1)
 
         ended = step.terminated | step.truncated
+        table = state.episodes
+        if table is not None:
+            table = episodes.record(table, step, state.head, self.length, self.context_length)
         return BufferState(
             steps=jax.tree.map(write, state.steps, step),
             head=(state.head + 1) % self.length,
             size=jnp.minimum(state.size + 1, self.length),
             running=jnp.where(ended, 0, jnp.minimum(state.running + 1, self.length)),
+            episodes=table,
         )
 
     def eligible(self, state: BufferState) -> jax.Array:
-        """int32 ``[N]``: how many of each column's oldest steps may be drawn."""
+        """int32 ``[N]``: how many of each column's oldest steps contiguous windows are drawn at."""
         if self.hindsight:
             return state.size - jnp.minimum(state.running, state.size)
         return jnp.full(self.num_envs, state.size)
 
     def can_sample(self, state: BufferState) -> jax.Array:
         """bool: whether there is any step to draw."""
+        if state.episodes is not None:
+            return jnp.any(state.episodes.count > 0)
         return jnp.any(self.eligible(state) > 0)
 
     def sample(
         self, state: BufferState, key: jax.Array, batch_size: int, rtg_discount: jax.Array
     ) -> Window:
-        """Draws B windows; ``can_sample`` must hold.
+        """Draws B windows; ``can_sample`` must hold (scattered ones have no real step otherwise).
 
         Args:
           state: the replay.
@@ -108,6 +123,10 @@ class TrajectoryBuffer:
           rtg_discount: scalar discount of hindsight return-to-go (unused without hindsight).
         """
         anchor_key, slot_key = jax.random.split(key)
+        if state.episodes is not None:
+            drawn = episodes.draw(state.episodes, anchor_key, batch_size)
+            places = episodes.distinct_sorted(slot_key, drawn.length, self.context_length)
+            return self.scattered_window(state, drawn, places, rtg_discount)
         ends = jnp.cumsum(self.eligible(state))
         draw = jax.random.randint(anchor_key, (batch_size,), 0, ends[-1])
         column = jnp.searchsorted(ends, draw, side="right")
@@ -162,4 +181,53 @@ class TrajectoryBuffer:
             mask=mask,
             bootstrap_mask=mask & (terminated | same_episode[:, 1:]),
             weight=1.0 / jnp.sum(real_step, axis=1),
+        )
+
+    def scattered_window(
+        self,
+        state: BufferState,
+        drawn: episodes.Drawn,
+        time_step: jax.Array,
+        rtg_discount: jax.Array,
+    ) -> Window:
+        """The windows of the steps ``time_step [B, K]`` of the episodes drawn."""
+        steps = state.steps
+        rows, start = drawn.column[:, None], drawn.start[:, None]
+        position = (start + time_step) % self.length  # [B, K]
+        next_position = (position + 1) % self.length
+        mask = jnp.broadcast_to(drawn.exists[:, None], position.shape)
+        terminated = steps.terminated[rows, position]
+        # A truncated episode's last state was not stored.
+        known = mask & ~terminated & ~steps.truncated[rows, position]
+        obs, reward = steps.obs[rows, position], steps.reward[rows, position]
+        return_so_far = steps.return_so_far[rows, position]
+        if self.hindsight:
+            ahead = jnp.arange(self.max_episode_steps)
+            rewards = steps.reward[rows, (start + ahead) % self.length]
+            rewards = jnp.where(ahead < drawn.length[:, None], rewards, 0.0)
+            sums = all_discounted_suffix_sums(rewards, rtg_discount)
+            sums = jnp.pad(sums, ((0, 0), (0, 1)))  # nothing after the last step
+            return_to_go = jnp.take_along_axis(sums, time_step, axis=1)
+            next_return_to_go = jnp.take_along_axis(sums, time_step + 1, axis=1)
+        else:
+            return_to_go = next_return_to_go = jnp.zeros(position.shape)
+        return Window(
+            obs=obs,
+            action=steps.action[rows, position],
+            reward=reward,
+            discount=1.0 - terminated.astype(jnp.float32),
+            return_so_far=return_so_far,
+            return_to_go=return_to_go,
+            time_step=time_step,
+            state_mask=mask,
+            mask=mask,
+            bootstrap_mask=mask & (terminated | known),
+            weight=drawn.exists.astype(jnp.float32),
+            following=States(
+                obs=jnp.where(known[..., None], steps.obs[rows, next_position], 0.0),
+                return_so_far=return_so_far + reward,
+                return_to_go=next_return_to_go,
+                time_step=time_step + 1,
+                mask=known,
+            ),
         )

@@ -15,7 +15,7 @@ from fractions import Fraction
 from typing import Any, Literal
 
 AgentName = Literal["sacformer", "sac"]
-PresetName = Literal["cpu", "paper"]
+PresetName = Literal["cpu", "paper", "authors"]
 Conditioning = Literal["hindsight", "commanded", "none"]
 EngineName = Literal["auto", "native", "mjx"]
 MjxPreset = Literal["parity", "fast"]
@@ -24,6 +24,9 @@ BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
 Tokens = Literal["gs", "gsa"]
 ComputeDtype = Literal["float32", "bfloat16"]
 ActingContext = Literal["window", "episode"]
+WindowKind = Literal["contiguous", "scattered"]
+PolicyKind = Literal["gaussian", "deterministic"]
+KernelInit = Literal["lecun", "xavier"]
 CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
@@ -94,12 +97,18 @@ class ContextConfig:
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
     acting_context_limit: int = 1000
     """Newest pairs seen at most with acting_context=episode."""
+    window: WindowKind = "contiguous"
+    """K steps of a window: contiguous, or drawn from one finished episode and sorted."""
     return_conditioning: Conditioning = "hindsight"
     """Return-to-go in training: obtained afterwards, commanded (Eq. 1 as in acting), or none."""
     target_return: float | Literal["auto"] = 5_000.0
     """G_1 in acting and in commanded conditioning; auto: the best training return so far, or 0."""
     return_scale: float = 1_000.0
     """Every return-to-go is divided by this."""
+    hindsight_scale: float | None = None
+    """Divides hindsight return-to-go instead of return_scale; none: the same."""
+    next_rtg_decrement: float | None = None
+    """Scattered windows: hindsight return-to-go at t+1 is that of t less this; none: its own."""
     rtg_discount: float = 0.99
     """Discount of hindsight return-to-go; 1 for none."""
     tokens: Tokens = "gs"
@@ -121,11 +130,25 @@ class ActorConfig:
     actor_mlp_ratio: int = 4
     """Hidden width of a block's MLP over actor_width (sacformer)."""
     actor_dropout: float = 0.1
-    """Dropout rate in updates (sacformer); off in acting and evaluation."""
+    """Dropout rate in updates (sacformer)."""
+    acting_dropout: bool = False
+    """Leave dropout on in acting and in evaluation."""
     actor_activation: Activation = "relu"
     """Activation function."""
     head_init_scale: float = 1.0
     """Gain of the Xavier-uniform initialization of the mean and log-std heads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """What the actor's heads stand for."""
+
+    policy: PolicyKind = "gaussian"
+    """Gaussian with entropy, or deterministic with noise in acting, in targets and in the loss."""
+    action_noise: float = 0.1
+    """Standard deviation of the noise of policy=deterministic, over half the action range."""
+    action_noise_clip: float = 0.25
+    """Largest noise of policy=deterministic, over half the action range."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +167,8 @@ class CriticConfig:
     """Activation function."""
     critic_layer_norm: bool = False
     """LayerNorm before each activation (mlp)."""
+    critic_init: KernelInit = "lecun"
+    """Initialization of the layers (mlp): LeCun-uniform or Xavier-uniform, biases zero."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,6 +216,7 @@ class Config:
     replay: ReplayConfig = dataclasses.field(default_factory=ReplayConfig)
     context: ContextConfig = dataclasses.field(default_factory=ContextConfig)
     actor: ActorConfig = dataclasses.field(default_factory=ActorConfig)
+    policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     critic: CriticConfig = dataclasses.field(default_factory=CriticConfig)
     precision: PrecisionConfig = dataclasses.field(default_factory=PrecisionConfig)
     sac: SacConfig = dataclasses.field(default_factory=SacConfig)

@@ -87,6 +87,18 @@ def commanded_return_to_go(
     return (target_return - return_so_far) / return_scale
 
 
+def all_discounted_suffix_sums(rewards: jax.Array, discount: jax.Array) -> jax.Array:
+    """``G_i = Σ_{l ≥ i} discount^(l-i) rewards_l`` for every position: ``[B, L]`` -> ``[B, L]``.
+
+    By doubling: sums of 1, 2, 4, … terms, so that L positions take log2(L) passes.
+    """
+    sums, span = rewards, 1
+    while span < rewards.shape[1]:
+        sums = sums + discount * jnp.pad(sums[:, span:], ((0, 0), (0, span)))
+        discount, span = discount * discount, 2 * span
+    return sums
+
+
 def discounted_suffix_sums(rewards: jax.Array, num: int, discount: jax.Array) -> jax.Array:
     """``G_i = Σ_{l ≥ i} discount^(l-i) rewards_l`` for the first ``num`` positions.
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax.config import CriticConfig
-from sacformer_jax.networks import MLP, embed_steps
+from sacformer_jax.networks import KERNEL_INITS, MLP, embed_steps
 from sacformer_jax.transformer import (
     Transformer,
     TransformerConfig,
@@ -30,13 +30,16 @@ class CriticInputs:
     """What a critic may look at besides the action it judges.
 
     Attributes:
-      obs: ``[B, K+1, O]``, normalized.
+      obs: ``[B, K, O]`` normalized, at the steps.
+      next_obs: ``[B, K, O]`` normalized, after them.
       action: ``[B, K, A]``, as replayed.
-      time_step: int32 ``[B, K+1]``.
+      time_step: int32 ``[B, K+1]``; like ``state_mask`` looked at by the transformer alone, whose
+        windows are contiguous.
       state_mask: bool ``[B, K+1]``.
     """
 
     obs: jax.Array
+    next_obs: jax.Array
     action: jax.Array
     time_step: jax.Array
     state_mask: jax.Array
@@ -74,7 +77,9 @@ def make_critics(
     """
     if config.critic == "mlp":
         widths = (config.critic_width,) * config.critic_layers
-        return mlp_critics(widths, config.critic_activation, config.critic_layer_norm, dtype)
+        return mlp_critics(
+            widths, config.critic_activation, config.critic_layer_norm, dtype, config.critic_init
+        )
     trunk = TransformerConfig(
         layers=config.critic_layers,
         width=config.critic_width,
@@ -106,25 +111,32 @@ class MLPCritic(nn.Module):
     activation: str
     layer_norm: bool
     dtype: str = "float32"
+    kernel_init: str = "lecun"
 
     @nn.compact
     def __call__(self, obs: jax.Array, action: jax.Array) -> jax.Array:
         """``obs [..., O]``, ``action [..., A]`` -> ``[...]``."""
         x = jnp.concatenate([obs, action], axis=-1)
-        x = MLP(self.widths, self.activation, self.layer_norm, self.dtype, name="mlp")(x)
-        return nn.Dense(1, kernel_init=nn.initializers.lecun_uniform(), name="q")(x)[..., 0]
+        mlp = MLP(
+            self.widths, self.activation, self.layer_norm, self.dtype, self.kernel_init, name="mlp"
+        )
+        return nn.Dense(1, kernel_init=KERNEL_INITS[self.kernel_init], name="q")(mlp(x))[..., 0]
 
 
 def mlp_critics(
-    widths: Sequence[int], activation: str, layer_norm: bool, dtype: str = "float32"
+    widths: Sequence[int],
+    activation: str,
+    layer_norm: bool,
+    dtype: str = "float32",
+    kernel_init: str = "lecun",
 ) -> TwinCritics:
     """Critics that see the state and the action alone (the paper's)."""
-    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm, dtype)
+    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm, dtype, kernel_init)
     apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
     return TwinCritics(
-        init=lambda key, inputs: critic.init(key, inputs.obs[:, :-1], inputs.action),
-        now=lambda params, inputs, candidate: apply(params, inputs.obs[:, :-1], candidate),
-        following=lambda params, inputs, candidate: apply(params, inputs.obs[:, 1:], candidate),
+        init=lambda key, inputs: critic.init(key, inputs.obs, inputs.action),
+        now=lambda params, inputs, candidate: apply(params, inputs.obs, candidate),
+        following=lambda params, inputs, candidate: apply(params, inputs.next_obs, candidate),
     )
 
 
@@ -208,7 +220,7 @@ def transformer_critics(
     def init(key: jax.Array, inputs: CriticInputs) -> Params:
         return critic.init(
             key,
-            inputs.obs[:, :-1],
+            inputs.obs,
             inputs.action,
             inputs.action,
             inputs.time_step[:, :-1],
@@ -218,7 +230,7 @@ def transformer_critics(
     def now(params: Params, inputs: CriticInputs, candidate: jax.Array) -> jax.Array:
         return apply(
             params,
-            inputs.obs[:, :-1],
+            inputs.obs,
             inputs.action,
             candidate,
             inputs.time_step[:, :-1],
@@ -229,7 +241,7 @@ def transformer_critics(
         nothing = jnp.zeros_like(candidate[:, :1])
         q = apply(
             params,
-            inputs.obs,
+            jnp.concatenate([inputs.obs, inputs.next_obs[:, -1:]], axis=1),  # [B, K+1, O]
             jnp.concatenate([inputs.action, nothing], axis=1),  # [B, K+1, A]
             jnp.concatenate([nothing, candidate], axis=1),  # [B, K+1, A]
             inputs.time_step,

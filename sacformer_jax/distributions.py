@@ -1,18 +1,33 @@
-"""The tanh-squashed Gaussian over a box of actions."""
+"""Distributions over a box of actions: the tanh-squashed Gaussian, and one point with noise."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 
+class ActionDistribution(Protocol):
+    """What an actor's heads stand for."""
+
+    def mode(self, mean: jax.Array) -> jax.Array:
+        """The action without noise, ``[..., A]``."""
+        ...
+
+    def sample_and_log_prob(
+        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """A reparameterized action ``[..., A]`` and its log density ``[...]``."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
-class TanhGaussian:
-    """``action = center + half_range * tanh(u)``, ``u ~ N(mean, exp(log_std)^2)``.
+class _Box:
+    """Action bounds.
 
     Attributes:
       low: lower action bounds.
@@ -31,8 +46,13 @@ class TanhGaussian:
         return ((np.asarray(self.high) - np.asarray(self.low)) / 2).astype(np.float32)
 
     def mode(self, mean: jax.Array) -> jax.Array:
-        """The action at the mean of the Gaussian, ``[..., A]``."""
+        """The action at the mean, ``[..., A]``: ``center + half_range * tanh(mean)``."""
         return self._center + self._half_range * jnp.tanh(mean)
+
+
+@dataclasses.dataclass(frozen=True)
+class TanhGaussian(_Box):
+    """``action = center + half_range * tanh(u)``, ``u ~ N(mean, exp(log_std)^2)``."""
 
     def sample_and_log_prob(
         self, key: jax.Array, mean: jax.Array, log_std: jax.Array
@@ -56,3 +76,29 @@ class TanhGaussian:
         squash = 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)) + np.log(self._half_range)
         log_prob = jnp.sum(gaussian - squash, axis=-1)
         return self._center + self._half_range * jnp.tanh(u), log_prob
+
+
+@dataclasses.dataclass(frozen=True)
+class NoisyPoint(_Box):
+    """``action = center + half_range * (tanh(mean) + noise)``, kept within the bounds.
+
+    The log density counts as 0: SAC without entropy.
+
+    Attributes:
+      noise: standard deviation of the noise, in half ranges.
+      noise_clip: its largest absolute value, in half ranges.
+    """
+
+    noise: float
+    noise_clip: float
+
+    def sample_and_log_prob(
+        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The noisy action ``[..., A]`` and zeros ``[...]``; ``log_std`` is not looked at."""
+        del log_std
+        noise = self.noise * jax.random.normal(key, mean.shape)
+        noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
+        action = self.mode(mean) + self._half_range * noise
+        bounded = jnp.clip(action, jnp.asarray(self.low), jnp.asarray(self.high))
+        return bounded, jnp.zeros(mean.shape[:-1])

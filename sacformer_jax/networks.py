@@ -21,6 +21,10 @@ from sacformer_jax.transformer import (
 )
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+KERNEL_INITS = {
+    "lecun": nn.initializers.lecun_uniform(),
+    "xavier": nn.initializers.xavier_uniform(),
+}
 
 
 def max_time_step(spec: EnvSpec) -> int:
@@ -222,17 +226,19 @@ class MLP(nn.Module):
       activation: one of :data:`~sacformer_jax.transformer.ACTIVATIONS`.
       layer_norm: LayerNorm before each activation.
       dtype: of the products; the output is float32.
+      kernel_init: one of :data:`KERNEL_INITS`.
     """
 
     widths: Sequence[int]
     activation: str = "relu"
     layer_norm: bool = False
     dtype: str = "float32"
+    kernel_init: str = "lecun"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for i, width in enumerate(self.widths):
-            init = nn.initializers.lecun_uniform()
+            init = KERNEL_INITS[self.kernel_init]
             x = nn.Dense(width, kernel_init=init, dtype=self.dtype, name=f"dense_{i}")(x)
             if self.layer_norm:
                 x = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name=f"ln_{i}")(x)

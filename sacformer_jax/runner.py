@@ -80,6 +80,12 @@ def train(config: Config, sources: dict[str, str] | None = None, quiet: bool = F
         reporter.facts(program, state, folder.path)
         with reporter.timed("compiling and running prefill"):
             state, _ = jax.block_until_ready(program.prefill(state))
+        if not program.buffer.can_sample(state.buffer):
+            raise ConfigError(
+                f"prefill_env_steps={config.run.prefill_env_steps}: no episode of at least "
+                f"context_length={config.context.context_length} steps finished in it; use more, "
+                "or a smaller context_length"
+            )
         return _Loop(program, folder, reporter, None).run(state)
 
 

@@ -83,6 +83,7 @@ def make_program(config: Config, env: VectorEnv | None = None) -> Program:
         context_length=config.context.context_length,
         max_episode_steps=env.max_episode_steps,
         hindsight=config.context.return_conditioning == "hindsight",
+        scattered=config.context.window == "scattered",
     )
     functions = _TrainingFunctions(config, env, agent, buffer)
     return Program(
@@ -109,6 +110,7 @@ def hyperparameters(config: Config, action_size: int) -> Hyperparameters:
         "target_entropy": target_entropy,
         "target_return": 0.0 if context.target_return == "auto" else context.target_return,
         "return_scale": context.return_scale,
+        "hindsight_scale": context.hindsight_scale or context.return_scale,
         "rtg_discount": context.rtg_discount,
     }
     return Hyperparameters(**{name: jnp.float32(value) for name, value in numbers.items()})

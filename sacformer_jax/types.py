@@ -56,8 +56,30 @@ class Acted:
 
 
 @flax.struct.dataclass
+class States:
+    """The states that followed the K steps of a scattered window, ``[B, K]`` leading.
+
+    Attributes:
+      obs: ``[B, K, O]`` raw observations; zero where ``mask`` is false.
+      return_so_far: ``[B, K]``, as in :class:`Window`.
+      return_to_go: ``[B, K]``, as in :class:`Window`.
+      time_step: int32 ``[B, K]``.
+      mask: bool ``[B, K]`` whether the state is known.
+    """
+
+    obs: jax.Array
+    return_so_far: jax.Array
+    return_to_go: jax.Array
+    time_step: jax.Array
+    mask: jax.Array
+
+
+@flax.struct.dataclass
 class Window:
-    """A batch of K contiguous steps of one episode each, with the K+1 states around them.
+    """A batch of K steps of one episode each.
+
+    Contiguous steps come with the K+1 states around them. Scattered steps (``following`` is there)
+    come with their own K states, ``[B, K]`` instead of ``[B, K+1]`` below, and those that followed.
 
     Attributes:
       obs: ``[B, K+1, O]`` raw observations; zero where ``state_mask`` is false.
@@ -72,7 +94,9 @@ class Window:
       mask: bool ``[B, K]`` a real step, for the actor loss.
       bootstrap_mask: bool ``[B, K]`` its successor is known, or it terminated: for the critic loss.
       weight: ``[B]`` one over the number of steps in the window: makes the expected weight of
-        every stored step the same although windows at the ends of episodes are short.
+        every stored step the same although windows at the ends of episodes are short. For
+        scattered windows 1.
+      following: the states that followed the steps of a scattered window; None where contiguous.
     """
 
     obs: jax.Array
@@ -86,6 +110,7 @@ class Window:
     mask: jax.Array
     bootstrap_mask: jax.Array
     weight: jax.Array
+    following: States | None = None
 
 
 @flax.struct.dataclass
@@ -114,6 +139,23 @@ class Transition:
 
 
 @flax.struct.dataclass
+class EpisodeTable:
+    """The finished episodes of each column that are all in the ring, oldest first.
+
+    Attributes:
+      start: int32 ``[N, E]`` ring position of the first step.
+      length: int32 ``[N, E]`` steps.
+      first: int32 ``[N]`` where the oldest entry of a column lies.
+      count: int32 ``[N]`` entries of a column.
+    """
+
+    start: jax.Array
+    length: jax.Array
+    first: jax.Array
+    count: jax.Array
+
+
+@flax.struct.dataclass
 class BufferState:
     """A ring over time for each environment column.
 
@@ -122,12 +164,14 @@ class BufferState:
       head: int32, the ring position written next (common to all columns).
       size: int32, steps stored in each column.
       running: int32 ``[N]``, newest steps of the column that belong to an unfinished episode.
+      episodes: what scattered windows are drawn from; None where windows are contiguous.
     """
 
     steps: Transition
     head: jax.Array
     size: jax.Array
     running: jax.Array
+    episodes: EpisodeTable | None
 
 
 @flax.struct.dataclass
@@ -159,6 +203,7 @@ class Hyperparameters:
       target_return: G_1, in units of reward; with ``target_return="auto"`` it rises with the best
         training return.
       return_scale: every return-to-go is divided by it before the network sees it.
+      hindsight_scale: hindsight return-to-go is divided by this instead of ``return_scale``.
       rtg_discount: discount of hindsight return-to-go.
     """
 
@@ -170,6 +215,7 @@ class Hyperparameters:
     target_entropy: jax.Array
     target_return: jax.Array
     return_scale: jax.Array
+    hindsight_scale: jax.Array
     rtg_discount: jax.Array
 
 

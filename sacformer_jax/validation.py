@@ -14,7 +14,7 @@ _AT_LEAST_ONE = (
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
-    "critic_learning_rate", "alpha", "alpha_learning_rate", "tau",
+    "critic_learning_rate", "alpha", "alpha_learning_rate", "tau", "action_noise_clip",
 )  # fmt: skip
 _AT_MOST_ONE = ("tau", "discount", "rtg_discount")
 
@@ -41,10 +41,12 @@ def check(config: Config) -> None:
             )
     for name in _AT_MOST_ONE:
         _require(values[name] <= 1, f"{name}={values[name]}: must be at most 1")
-    for name in ("discount", "rtg_discount", "prefill_env_steps", "seed"):
+    for name in ("discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise"):
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
     _check_actor(config)
+    _check_policy(config)
+    _check_window(config)
     _check_target_return(config)
     _check_acting(config)
     _check_critic(config)
@@ -56,6 +58,11 @@ def _check_actor(config: Config) -> None:
     _require(
         0 <= actor.actor_dropout < 1,
         f"actor_dropout={actor.actor_dropout}: must be at least 0 and below 1",
+    )
+    _require(
+        not actor.acting_dropout or (config.agent != "sac" and actor.actor_dropout > 0),
+        "acting_dropout=True: there is no dropout to leave on; use agent=sacformer with "
+        "actor_dropout above 0",
     )
     if config.agent == "sac":
         _require(
@@ -83,6 +90,53 @@ def _check_actor(config: Config) -> None:
             f"tokens={context.tokens!r}: with context_length=1 there is no action before the "
             "state; use context_length of 2 or more",
         )
+
+
+def _check_policy(config: Config) -> None:
+    _require(
+        config.policy.policy == "gaussian" or not config.sac.tune_alpha,
+        "tune_alpha=True: policy=deterministic has no entropy to tune it by; use "
+        "tune_alpha=False, or policy=gaussian",
+    )
+
+
+def _check_window(config: Config) -> None:
+    context = config.context
+    scale, decrement = context.hindsight_scale, context.next_rtg_decrement
+    for name, value in (("hindsight_scale", scale), ("next_rtg_decrement", decrement)):
+        _require(
+            value is None or context.return_conditioning == "hindsight",
+            f"{name}={value}: is for return_conditioning=hindsight, not "
+            f"{context.return_conditioning}; leave it out",
+        )
+    _require(
+        scale is None or bool(np.float32(scale) > 0),
+        f"hindsight_scale={scale}: must be greater than 0",
+    )
+    if context.window == "contiguous":
+        _require(
+            decrement is None,
+            f"next_rtg_decrement={decrement}: window=contiguous shows what followed; leave it "
+            "out, or use window=scattered",
+        )
+        return
+    reasons = {
+        "agent=sac sees one state; use window=contiguous, or agent=sacformer": (
+            config.agent != "sac"
+        ),
+        "with tokens=gsa an action must stand before the state it led to; use tokens=gs": (
+            context.tokens == "gs"
+        ),
+        "critic=transformer needs the steps before the one it judges; use critic=mlp": (
+            config.critic.critic == "mlp"
+        ),
+        f"context_length={context.context_length} different steps cannot be drawn from episodes "
+        f"of at most max_episode_steps={config.task.max_episode_steps}": (
+            context.context_length <= config.task.max_episode_steps
+        ),
+    }
+    for reason, holds in reasons.items():
+        _require(holds, f"window={context.window!r}: {reason}")
 
 
 def _check_target_return(config: Config) -> None:
@@ -163,8 +217,8 @@ def _check_steps(config: Config) -> None:
         f"total_env_steps={run.total_env_steps}, beyond the counters' range",
     )
     needed = 1
-    if config.context.return_conditioning == "hindsight":
-        # Only finished episodes have a hindsight return.
+    if config.context.return_conditioning == "hindsight" or config.context.window == "scattered":
+        # Only finished episodes are replayed.
         needed = task.max_episode_steps
     _require(
         config.prefill_vector_steps >= needed,

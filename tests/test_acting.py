@@ -237,6 +237,35 @@ def test_it_trains_and_repeats(program):
     np.testing.assert_array_equal(trained(), trained())
 
 
+@pytest.mark.parametrize("acting_context", ["window", "episode"])
+def test_dropout_in_acting_is_drawn_from_the_key(acting_context):
+    settings = {"acting_context": acting_context, "actor_dropout": 0.4}
+    agent, _, policy = make_agent(acting_config(**settings, acting_dropout=True), 30)
+    plain, _, _ = make_agent(acting_config(**settings), 30)
+    obs = jnp.ones((2, OBS))
+
+    def mean_action(agent, seed):
+        start = contexts.start(obs, 4, ACT, agent.init_cache(2))
+        act = jax.jit(agent.act, static_argnames="explore")
+        return np.asarray(act(policy, start, jax.random.key(seed), explore=False).action)
+
+    np.testing.assert_array_equal(mean_action(agent, 0), mean_action(agent, 0))
+    assert (mean_action(agent, 0) != mean_action(agent, 1)).any()
+    assert (mean_action(agent, 0)[0] != mean_action(agent, 0)[1]).any()  # each its own mask
+    np.testing.assert_array_equal(mean_action(plain, 0), mean_action(plain, 1))
+
+
+def test_a_policy_with_dropout_draws_anew_at_every_step_and_repeats_after_reset():
+    config = acting_config(acting_context="window", acting_dropout=True, actor_dropout=0.4)
+    agent, spec, state = make_agent(config, 30)
+    policy = Policy(config, spec, agent, state)
+    actions = [policy.predict(np.ones(OBS)) for _ in range(2)]
+    policy.reset()
+    np.testing.assert_array_equal(policy.predict(np.ones(OBS)), actions[0])
+    other = Policy(config, spec, agent, state)
+    np.testing.assert_array_equal(other.predict(np.ones(OBS)), actions[0])
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

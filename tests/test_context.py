@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from sacformer_jax import context as contexts
 from sacformer_jax.types import Acted
@@ -65,3 +66,16 @@ def test_suffix_sums_against_float64_and_far_from_the_origin():
 def test_suffix_sums_of_a_single_position():
     got = contexts.discounted_suffix_sums(jnp.array([[1.0, 2.0, 4.0]]), 1, jnp.float32(0.5))
     assert got.tolist() == [[3.0]]
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 8, 9])
+@pytest.mark.parametrize("discount", [0.0, 0.9, 1.0])
+def test_all_suffix_sums_are_backward_sums(length, discount):
+    rewards = np.random.default_rng(length).normal(size=(3, length)).astype(np.float32)
+    expected = np.zeros((3, length))
+    total = np.zeros(3)
+    for i in reversed(range(length)):
+        total = rewards[:, i] + discount * total
+        expected[:, i] = total
+    got = jax.jit(contexts.all_discounted_suffix_sums)(rewards, jnp.float32(discount))
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)

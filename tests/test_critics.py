@@ -28,8 +28,10 @@ def make_inputs(seed=0) -> CriticInputs:
     mask = np.ones((BATCH, K + 1), bool)
     mask[1, :2] = False  # a window before an episode's start
     mask[2, -1:] = False  # past its end
+    obs = rng.normal(size=(BATCH, K + 1, OBS)).astype(np.float32)
     return CriticInputs(
-        obs=rng.normal(size=(BATCH, K + 1, OBS)).astype(np.float32),
+        obs=obs[:, :-1],
+        next_obs=obs[:, 1:],
         action=rng.uniform(-1, 1, (BATCH, K, ACT)).astype(np.float32),
         time_step=rng.integers(0, MAX_TIME, (BATCH, K + 1)).astype(np.int32),
         state_mask=mask,
@@ -52,8 +54,8 @@ def test_mlp_critics_are_two_mlps():
     critics, inputs, candidate = mlp_critics((8, 8), "relu", False), make_inputs(), make_candidate()
     params = jax.jit(critics.init)(jax.random.key(0), inputs)
     for judge, obs in (
-        (critics.now, inputs.obs[:, :-1]),
-        (critics.following, inputs.obs[:, 1:]),
+        (critics.now, inputs.obs),
+        (critics.following, inputs.next_obs),
     ):
         q = jax.jit(judge)(params, inputs, candidate)
         assert q.shape == (2, BATCH, K)
@@ -119,13 +121,13 @@ def test_transformer_critics_equal_numpy(layers, heads):
         p = jax.tree.map(lambda x, i=i: np.asarray(x[i], np.float64), params["params"])
         for b in range(BATCH):
             time, real = inputs.time_step[b], inputs.state_mask[b]
-            arguments = (inputs.obs[b, :K], inputs.action[b], candidate[b], time[:K], real[:K])
+            arguments = (inputs.obs[b], inputs.action[b], candidate[b], time[:K], real[:K])
             np.testing.assert_allclose(
                 now[i, b], oracle(p, *arguments, layers, heads), rtol=1e-5, atol=1e-5
             )
             nothing = np.full((1, ACT), 9.0)  # whatever is put there, nobody sees it
             arguments = (
-                inputs.obs[b],
+                np.concatenate([inputs.obs[b], inputs.next_obs[b, -1:]]),
                 np.concatenate([inputs.action[b], nothing]),
                 np.concatenate([nothing, candidate[b]]),
                 time,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sacformer_jax.distributions import TanhGaussian
+from sacformer_jax.distributions import NoisyPoint, TanhGaussian
 
 LOW, HIGH = (-1.0, -0.4), (1.0, 0.8)
 
@@ -51,3 +51,18 @@ def test_samples_and_mode_fill_the_bounds():
     np.testing.assert_allclose(action.min(axis=0), LOW, atol=0.02)
     np.testing.assert_allclose(action.max(axis=0), HIGH, atol=0.02)
     np.testing.assert_allclose(distribution.mode(jnp.zeros(2)), [0.0, 0.2], atol=1e-6)
+
+
+def test_a_noisy_point_stays_near_its_mode_and_within_the_bounds():
+    point = NoisyPoint(LOW, HIGH, noise=0.1, noise_clip=0.25)
+    mean = jnp.broadcast_to(jnp.array([0.2, 3.0]), (20_000, 2))
+    action, log_prob = point.sample_and_log_prob(jax.random.key(0), mean, mean)
+    assert log_prob.shape == (20_000,)
+    assert not log_prob.any()
+    away = np.asarray(action - point.mode(mean)) / np.array([1.0, 0.6])  # in half ranges
+    assert away[:, 0].std() == pytest.approx(0.1, rel=0.05)
+    assert np.abs(away).max() == pytest.approx(0.25, abs=1e-6)  # 1 in 80 draws is clipped
+    assert (np.asarray(action) >= np.float32(LOW)).all()
+    assert (np.asarray(action) <= np.float32(HIGH)).all()
+    assert (np.asarray(action)[:, 1] == np.float32(0.8)).mean() > 0.3  # tanh(3) is near the bound
+    np.testing.assert_allclose(point.mode(mean), TanhGaussian(LOW, HIGH).mode(mean))

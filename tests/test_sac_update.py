@@ -17,7 +17,7 @@ from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.transformer import TransformerConfig
-from sacformer_jax.types import Window
+from sacformer_jax.types import States, Window
 
 B, K = 5, 3
 
@@ -214,7 +214,9 @@ def test_a_transformer_critic_learns_from_the_same_loss():
 
     gaussian = shown(config, spec, learner, window)
     critics = make_critics(config.critic, "float32", K, spec.max_episode_steps + 1)
-    inputs = CriticInputs(window.obs, window.action, window.time_step, window.state_mask)
+    inputs = CriticInputs(
+        window.obs[:, :-1], window.obs[:, 1:], window.action, window.time_step, window.state_mask
+    )
     next_action, next_log_prob = numpy_sample(
         jax.tree.map(lambda x: x[:, 1:], gaussian), jax.random.split(key, 3)[1]
     )
@@ -240,13 +242,10 @@ def test_a_transformer_critic_learns_from_the_same_loss():
 # --- one pass against two --------------------------------------------------------------------
 
 
-def two_pass_update(config, spec, learner, hyper, window, key):
-    """The same update with a pass of its own for π_t and for π_{t+1}, and optax's Adam."""
-    actor, critic = networks(config, spec)
-    _, next_key, action_key = jax.random.split(key, 3)
-    k = window.action.shape[1]
+def contiguous_policies(config, spec, hyper, window):
+    """π at the K steps and after them as functions of the parameters, each a pass of its own."""
+    actor, k = networks(config, spec)[0], window.action.shape[1]
     return_to_go = (hyper.target_return - window.return_so_far) / hyper.return_scale
-    alpha = jnp.exp(learner.log_alpha)
 
     def policy(params, states):
         return actor.apply(
@@ -258,6 +257,19 @@ def two_pass_update(config, spec, learner, hyper, window, key):
             window.state_mask[:, :states],
         )
 
+    return (
+        lambda params: policy(params, k),
+        lambda params: jax.tree.map(lambda x: x[:, 1:], policy(params, k + 1)),
+    )
+
+
+def reference_update(config, spec, learner, hyper, window, key, policies, obs, next_obs):
+    """The update written out, by two passes and optax's Adam."""
+    critic = networks(config, spec)[1]
+    now, after = policies
+    _, next_key, action_key = jax.random.split(key, 3)
+    alpha = jnp.exp(learner.log_alpha)
+
     def sample(mean, log_std, key):
         noise = jax.random.normal(key, mean.shape)
         u = mean + jnp.exp(log_std) * noise
@@ -265,9 +277,9 @@ def two_pass_update(config, spec, learner, hyper, window, key):
         log_prob -= 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2)
         return jnp.tanh(u), log_prob.sum(-1)
 
-    following = policy(learner.actor_params, k + 1)
-    next_action, next_log_prob = sample(following.mean[:, 1:], following.log_std[:, 1:], next_key)
-    next_q = critic.apply(learner.target_critic_params, window.obs[:, 1:], next_action).min(0)
+    following = after(learner.actor_params)
+    next_action, next_log_prob = sample(following.mean, following.log_std, next_key)
+    next_q = critic.apply(learner.target_critic_params, next_obs, next_action).min(0)
     y = window.reward + hyper.discount * window.discount * (next_q - alpha * next_log_prob)
 
     def mean_over(values, mask):
@@ -275,7 +287,7 @@ def two_pass_update(config, spec, learner, hyper, window, key):
         return (values * weights).sum() / weights.sum()
 
     def critic_loss(params):
-        q = critic.apply(params, window.obs[:, :-1], window.action)
+        q = critic.apply(params, obs, window.action)
         return mean_over((q[0] - y) ** 2 + (q[1] - y) ** 2, window.bootstrap_mask)
 
     def step(params, grads, learning_rate):
@@ -287,9 +299,9 @@ def two_pass_update(config, spec, learner, hyper, window, key):
     critic_params = step(learner.critic_params, critic_grads, hyper.critic_learning_rate)
 
     def actor_loss(params):
-        current = policy(params, k)
+        current = now(params)
         action, log_prob = sample(current.mean, current.log_std, action_key)
-        q = critic.apply(critic_params, window.obs[:, :-1], action).min(0)
+        q = critic.apply(critic_params, obs, action).min(0)
         return mean_over(alpha * log_prob - q, window.mask), log_prob
 
     grads, log_prob = jax.grad(actor_loss, has_aux=True)(learner.actor_params)
@@ -303,23 +315,136 @@ def two_pass_update(config, spec, learner, hyper, window, key):
     return actor_params, critic_params, log_alpha
 
 
-def test_one_pass_equals_two_passes(setup):
-    config, spec, update, learner, hyper = setup
-    window, key = make_window(3), jax.random.key(9)
-    new, _ = update(learner, hyper, window, key)
-    actor_params, critic_params, log_alpha = jax.jit(
-        lambda learner, window: two_pass_update(config, spec, learner, hyper, window, key)
-    )(learner, window)
+def check_update(new, learner, hyper, reference):
     ours = (new.actor_params, new.critic_params, new.log_alpha)
-    reference = (actor_params, critic_params, log_alpha)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(reference), strict=True):
         # Adam's first step divides by the gradient's size: rounding shows where it is tiny.
         np.testing.assert_allclose(a, b, atol=3e-5)
-    target = soft_update(learner.target_critic_params, critic_params, hyper.tau)
+    target = soft_update(learner.target_critic_params, reference[1], hyper.tau)
     for a, b in zip(
         jax.tree.leaves(new.target_critic_params), jax.tree.leaves(target), strict=True
     ):
         np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_one_pass_equals_two_passes(setup):
+    config, spec, update, learner, hyper = setup
+    window, key = make_window(3), jax.random.key(9)
+    new, _ = update(learner, hyper, window, key)
+
+    @jax.jit
+    def reference(learner, window):
+        policies = contiguous_policies(config, spec, hyper, window)
+        obs, next_obs = window.obs[:, :-1], window.obs[:, 1:]
+        return reference_update(config, spec, learner, hyper, window, key, policies, obs, next_obs)
+
+    check_update(new, learner, hyper, reference(learner, window))
+
+
+def make_scattered(seed=0) -> Window:
+    """Windows of K steps and what followed each, some of it unknown."""
+    rng = np.random.default_rng(seed)
+    base = make_window(seed)
+    known = np.ones((B, K), bool)
+    known[1:3, -1] = False
+    discount = np.ones((B, K), np.float32)
+    discount[1, -1] = 0.0  # terminated; the second window's end was truncated
+
+    def number(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    return dataclasses.replace(
+        base,
+        obs=number(B, K, 2),
+        discount=jnp.asarray(discount),
+        return_so_far=number(B, K),
+        return_to_go=number(B, K),
+        time_step=jnp.sort(jnp.asarray(rng.integers(0, 19, (B, K)), jnp.int32), axis=1),
+        state_mask=jnp.ones((B, K), bool),
+        mask=jnp.ones((B, K), bool),
+        bootstrap_mask=jnp.asarray(known | (discount == 0)),
+        weight=jnp.ones(B).at[4].set(0.0),
+        following=States(
+            obs=number(B, K, 2),
+            return_so_far=number(B, K),
+            return_to_go=number(B, K),
+            time_step=jnp.asarray(rng.integers(0, 19, (B, K)), jnp.int32),
+            mask=jnp.asarray(known),
+        ),
+    )
+
+
+@pytest.mark.parametrize("conditioning", ["hindsight", "decremented", "commanded"])
+def test_scattered_windows_take_two_passes(conditioning):
+    fields = {"context_length": K, "window": "scattered", "prefill_env_steps": 80}
+    if conditioning != "commanded":
+        fields |= {"return_conditioning": "hindsight", "hindsight_scale": 500.0}
+    if conditioning == "decremented":
+        fields["next_rtg_decrement"] = 0.25
+    config, spec = point_config(**fields).validated(), point_env(1).spec
+    agent, hyper = agents.make(config, spec), hyperparameters(config, 1)
+    learner = jax.jit(agent.init)(jax.random.key(0))
+    window, key = make_scattered(2), jax.random.key(9)
+    new, _ = jax.jit(agent.update)(learner, hyper, window, key)
+    after = window.following
+    shown, next_shown = {
+        "hindsight": (window.return_to_go / 500.0, after.return_to_go / 500.0),
+        "decremented": (window.return_to_go / 500.0, window.return_to_go / 500.0 - 0.25),
+        "commanded": (-window.return_so_far / 10.0, -after.return_so_far / 10.0),
+    }[conditioning]
+    actor = networks(config, spec)[0]
+
+    @jax.jit
+    def reference(learner):
+        def now(params):
+            return actor.apply(
+                params, window.obs, window.action, shown, window.time_step, window.state_mask
+            )
+
+        def following(params):
+            return actor.apply(
+                params, after.obs, window.action, next_shown, after.time_step, after.mask
+            )
+
+        return reference_update(
+            config, spec, learner, hyper, window, key, (now, following), window.obs, after.obs
+        )
+
+    check_update(new, learner, hyper, reference(learner))
+
+
+def test_a_deterministic_policy_has_no_entropy():
+    """Its loss is Q alone, whatever α; targets and loss see the action with bounded noise."""
+    config = point_config(context_length=K, policy="deterministic", tune_alpha=False, alpha=5.0)
+    spec = point_env(1).spec
+    agent, hyper = agents.make(config.validated(), spec), hyperparameters(config, 1)
+    learner = jax.jit(agent.init)(jax.random.key(0))
+    window, key = make_window(), jax.random.key(7)
+    _, metrics = jax.jit(agent.update)(learner, hyper, window, key)
+    gaussian = shown(config, spec, learner, window)
+    _, next_key, action_key = jax.random.split(key, 3)
+
+    def noisy(mean, key):
+        noise = np.clip(0.1 * np.asarray(jax.random.normal(key, mean.shape)), -0.25, 0.25)
+        return np.clip(np.tanh(mean) + noise, -1, 1)
+
+    def mean_over(values, mask):
+        weight = np.asarray(window.weight)[:, None] * mask
+        return float((values * weight).sum() / weight.sum())
+
+    obs = np.asarray(window.obs)
+    next_q = numpy_q(
+        learner.target_critic_params, obs[:, 1:], noisy(gaussian.mean[:, 1:], next_key)
+    )
+    y = window.reward + 0.99 * window.discount * next_q.min(0)
+    q = numpy_q(learner.critic_params, obs[:, :-1], window.action)
+    expected = mean_over(((q - y) ** 2).sum(0), window.bootstrap_mask)
+    assert float(metrics["critic_loss"]) == pytest.approx(expected, rel=1e-4)
+    assert float(metrics["entropy"]) == 0.0
+    # The critics have moved by one step of Adam since.
+    q = numpy_q(learner.critic_params, obs[:, :-1], noisy(gaussian.mean[:, :-1], action_key))
+    expected = mean_over(-q.min(0), window.mask)
+    assert float(metrics["actor_loss"]) == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.parametrize("conditioning", ["hindsight", "none"])

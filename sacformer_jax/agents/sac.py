@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from sacformer_jax.agents.core import Agent
-from sacformer_jax.agents.sac_update import make_sac_agent, sac_parts
+from sacformer_jax.agents.sac_policy import sac_parts
+from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import MLPActor

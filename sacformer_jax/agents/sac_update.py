@@ -6,86 +6,19 @@ Letters: B windows, K steps, A action size. Losses are weighted means over the r
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from functools import partial
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
 
 from sacformer_jax import normalizer
+from sacformer_jax.agents import sac_policy
 from sacformer_jax.agents.core import Agent, Metrics
-from sacformer_jax.config import Conditioning, Config
-from sacformer_jax.context import commanded_return_to_go
-from sacformer_jax.critics import CriticInputs, TwinCritics, make_critics
-from sacformer_jax.distributions import TanhGaussian
-from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import GaussianParams, max_time_step
-from sacformer_jax.types import (
-    Acted,
-    Cache,
-    Context,
-    Hyperparameters,
-    LearnerState,
-    Params,
-    PolicyState,
-    Window,
-)
-
-
-@dataclasses.dataclass(frozen=True)
-class SACParts:
-    """The static parts of the update.
-
-    Attributes:
-      actor: network of the signature of :class:`~sacformer_jax.networks.TransformerActor`.
-      acting_actor: the same network, as it acts: with a cache or without.
-      critics: twin critics over windows.
-      distribution: the policy's distribution over the action bounds.
-      obs_size: O.
-      action_size: A.
-      context_length: K.
-      return_conditioning: what the actor is conditioned on in training.
-      tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
-      initial_alpha: α at the start.
-      normalize_obs: use the running observation statistics.
-    """
-
-    actor: nn.Module
-    acting_actor: nn.Module
-    critics: TwinCritics
-    distribution: TanhGaussian
-    obs_size: int
-    action_size: int
-    context_length: int
-    return_conditioning: Conditioning
-    tune_alpha: bool
-    initial_alpha: float
-    normalize_obs: bool
-
-
-def sac_parts(
-    config: Config, spec: EnvSpec, actor: nn.Module, acting_actor: nn.Module | None = None
-) -> SACParts:
-    """The parts that a configuration and an environment ask for, around ``actor``."""
-    return SACParts(
-        actor=actor,
-        acting_actor=acting_actor or actor,
-        critics=make_critics(
-            config.critic,
-            config.precision.compute_dtype,
-            config.context.context_length,
-            max_time_step(spec),
-        ),
-        distribution=TanhGaussian(spec.action_low, spec.action_high),
-        obs_size=spec.obs_size,
-        action_size=spec.action_size,
-        context_length=config.context.context_length,
-        return_conditioning=config.context.return_conditioning,
-        tune_alpha=config.sac.tune_alpha,
-        initial_alpha=config.sac.alpha,
-        normalize_obs=config.context.normalize_obs,
-    )
+from sacformer_jax.agents.sac_policy import SACParts, prepare_obs, window_policies
+from sacformer_jax.critics import CriticInputs
+from sacformer_jax.networks import GaussianParams
+from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
 
 def weighted_mean(values: jax.Array, weights: jax.Array) -> jax.Array:
@@ -120,9 +53,6 @@ def bellman_target(
 def make_sac_agent(parts: SACParts) -> Agent:
     """Binds the parts to the shared SAC functions."""
     actor, critics, distribution = parts.actor, parts.critics, parts.distribution
-    apply_actor: Callable[..., GaussianParams] = actor.apply  # type: ignore[assignment]
-    apply_acting: Callable[..., tuple[GaussianParams, Params]]
-    apply_acting = parts.acting_actor.apply
     adam = optax.scale_by_adam()
 
     def apply_adam(
@@ -131,19 +61,13 @@ def make_sac_agent(parts: SACParts) -> Agent:
         direction, opt_state = adam.update(grads, opt_state)
         return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), opt_state
 
-    def prepare_obs(learner_or_policy: LearnerState | PolicyState, obs: jax.Array) -> jax.Array:
-        if parts.normalize_obs:
-            return normalizer.normalize(learner_or_policy.normalizer, obs)
-        return obs
-
-    def training_return_to_go(window: Window, hyper: Hyperparameters) -> jax.Array:
-        if parts.return_conditioning == "hindsight":
-            return window.return_to_go / hyper.return_scale
-        if parts.return_conditioning == "commanded":
-            return commanded_return_to_go(
-                window.return_so_far, hyper.target_return, hyper.return_scale
-            )
-        return jnp.zeros_like(window.return_to_go)
+    def critic_inputs(learner: LearnerState, window: Window) -> CriticInputs:
+        obs = prepare_obs(parts, learner, window.obs)
+        if window.following is None:
+            now, following = obs[:, :-1], obs[:, 1:]
+        else:
+            now, following = obs, prepare_obs(parts, learner, window.following.obs)
+        return CriticInputs(now, following, window.action, window.time_step, window.state_mask)
 
     def init(key: jax.Array) -> LearnerState:
         actor_key, critic_key = jax.random.split(key)
@@ -160,7 +84,8 @@ def make_sac_agent(parts: SACParts) -> Agent:
         critic_params = critics.init(
             critic_key,
             CriticInputs(
-                obs=obs,
+                obs=obs[:, :-1],
+                next_obs=obs[:, 1:],
                 action=jnp.zeros((1, parts.context_length, parts.action_size)),
                 time_step=jnp.zeros(states, jnp.int32),
                 state_mask=jnp.ones(states, bool),
@@ -179,73 +104,25 @@ def make_sac_agent(parts: SACParts) -> Agent:
             normalizer=normalizer.init(parts.obs_size),
         )
 
-    def init_cache(num_envs: int) -> Cache:
-        pairs = (num_envs, parts.context_length)
-        variables = jax.eval_shape(
-            parts.acting_actor.init,
-            jax.random.key(0),
-            jnp.zeros((*pairs, parts.obs_size)),
-            jnp.zeros((*pairs, parts.action_size)),
-            jnp.zeros(pairs),
-            jnp.zeros(pairs, jnp.int32),
-            jnp.ones(pairs, bool),
-        )
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), variables.get("cache", {}))
-
-    def act(policy: PolicyState, context: Context, key: jax.Array, explore: bool) -> Acted:
-        return_to_go = commanded_return_to_go(
-            context.return_so_far, policy.target_return, policy.return_scale
-        )
-        if parts.return_conditioning == "none":
-            return_to_go = jnp.zeros_like(return_to_go)
-        gaussian, changed = apply_acting(
-            {**policy.actor_params, "cache": context.cache},
-            prepare_obs(policy, context.obs),
-            context.action,
-            return_to_go,
-            context.time_step,
-            context.mask,
-            mutable=["cache"],
-        )
-        mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
-        if explore:
-            action = distribution.sample_and_log_prob(key, mean, log_std)[0]
-        else:
-            action = distribution.mode(mean)
-        return Acted(action, dataclasses.replace(context, cache=changed.get("cache", {})))
-
     def update(
         learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
     ) -> tuple[LearnerState, Metrics]:
         dropout_key, next_key, action_key = jax.random.split(key, 3)
-        obs = prepare_obs(learner, window.obs)
         alpha = jnp.exp(learner.log_alpha)
         actor_weight = window.weight[:, None] * window.mask
         critic_weight = window.weight[:, None] * window.bootstrap_mask
 
-        # One causal pass over the K+1 states gives π at t and at t+1. The action at the last state
-        # is not known, and seen by nobody.
-        action = jnp.pad(window.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
+        def policies(actor_params: Params) -> tuple[GaussianParams, GaussianParams]:
+            both = window_policies(parts, actor_params, learner, hyper, window, dropout_key)
+            return both.now, both.following
 
-        def distributions(actor_params: Params) -> GaussianParams:
-            return apply_actor(
-                actor_params,
-                obs,
-                action,
-                training_return_to_go(window, hyper),
-                window.time_step,
-                window.state_mask,
-                deterministic=False,
-                rngs={"dropout": dropout_key},
-            )
-
-        gaussian, pull_back = jax.vjp(distributions, learner.actor_params)
+        gaussian, pull_back, next_gaussian = jax.vjp(policies, learner.actor_params, has_aux=True)
 
         # Critics (Eq. 6-8). Nothing here is differentiated with respect to the actor.
         next_action, next_log_prob = distribution.sample_and_log_prob(
-            next_key, gaussian.mean[:, 1:], gaussian.log_std[:, 1:]
+            next_key, next_gaussian.mean, next_gaussian.log_std
         )
-        inputs = CriticInputs(obs, window.action, window.time_step, window.state_mask)
+        inputs = critic_inputs(learner, window)
         next_q = critics.following(learner.target_critic_params, inputs, next_action)
         y = bellman_target(
             window.reward, hyper.discount * window.discount, next_q, next_log_prob, alpha
@@ -262,10 +139,10 @@ def make_sac_agent(parts: SACParts) -> Agent:
             learner.critic_params, critic_grads, learner.critic_opt, hyper.critic_learning_rate
         )
 
-        # Actor (Eq. 10-13), through the distributions of the pass above.
+        # Actor (Eq. 10-13), through the distributions above.
         def actor_loss(gaussian: GaussianParams) -> tuple[jax.Array, jax.Array]:
             action, log_prob = distribution.sample_and_log_prob(
-                action_key, gaussian.mean[:, :-1], gaussian.log_std[:, :-1]
+                action_key, gaussian.mean, gaussian.log_std
             )
             min_q = jnp.min(critics.now(critic_params, inputs, action), axis=0)
             return weighted_mean(alpha * log_prob - min_q, actor_weight), log_prob
@@ -310,4 +187,9 @@ def make_sac_agent(parts: SACParts) -> Agent:
         }
         return new_learner, metrics
 
-    return Agent(init=init, init_cache=init_cache, act=act, update=update)
+    return Agent(
+        init=init,
+        init_cache=partial(sac_policy.init_cache, parts),
+        act=partial(sac_policy.act, parts),
+        update=update,
+    )

@@ -1,0 +1,256 @@
+"""SAC's policy: what SACFormer's and SAC's differ in, acting, and π over windows.
+
+Letters: N environments, B windows, K steps, O, A.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax import normalizer
+from sacformer_jax.config import Conditioning, Config
+from sacformer_jax.context import commanded_return_to_go
+from sacformer_jax.critics import TwinCritics, make_critics
+from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
+from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.networks import GaussianParams, max_time_step
+from sacformer_jax.types import (
+    Acted,
+    Cache,
+    Context,
+    Hyperparameters,
+    LearnerState,
+    Params,
+    PolicyState,
+    States,
+    Window,
+)
+
+_DROPOUT_STREAM = 2**31
+"""Folded into the acting key, apart from the exploration noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SACParts:
+    """The static parts of the update.
+
+    Attributes:
+      actor: network of the signature of :class:`~sacformer_jax.networks.TransformerActor`.
+      acting_actor: the same network, as it acts: with a cache or without.
+      critics: twin critics over windows.
+      distribution: the policy's distribution over the action bounds.
+      obs_size: O.
+      action_size: A.
+      context_length: K.
+      return_conditioning: what the actor is conditioned on in training.
+      next_rtg_decrement: hindsight return-to-go after a scattered step is that at the step less
+        this; None: its own.
+      acting_dropout: dropout is on in acting, too.
+      tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
+      initial_alpha: α at the start.
+      normalize_obs: use the running observation statistics.
+    """
+
+    actor: nn.Module
+    acting_actor: nn.Module
+    critics: TwinCritics
+    distribution: ActionDistribution
+    obs_size: int
+    action_size: int
+    context_length: int
+    return_conditioning: Conditioning
+    next_rtg_decrement: float | None
+    acting_dropout: bool
+    tune_alpha: bool
+    initial_alpha: float
+    normalize_obs: bool
+
+
+def sac_parts(
+    config: Config, spec: EnvSpec, actor: nn.Module, acting_actor: nn.Module | None = None
+) -> SACParts:
+    """The parts that a configuration and an environment ask for, around ``actor``."""
+    return SACParts(
+        actor=actor,
+        acting_actor=acting_actor or actor,
+        critics=make_critics(
+            config.critic,
+            config.precision.compute_dtype,
+            config.context.context_length,
+            max_time_step(spec),
+        ),
+        distribution=_distribution(config, spec),
+        obs_size=spec.obs_size,
+        action_size=spec.action_size,
+        context_length=config.context.context_length,
+        return_conditioning=config.context.return_conditioning,
+        next_rtg_decrement=config.context.next_rtg_decrement,
+        acting_dropout=config.actor.acting_dropout,
+        tune_alpha=config.sac.tune_alpha,
+        initial_alpha=config.sac.alpha,
+        normalize_obs=config.context.normalize_obs,
+    )
+
+
+def _distribution(config: Config, spec: EnvSpec) -> ActionDistribution:
+    low, high, settings = spec.action_low, spec.action_high, config.policy
+    if settings.policy == "deterministic":
+        return NoisyPoint(low, high, settings.action_noise, settings.action_noise_clip)
+    return TanhGaussian(low, high)
+
+
+def prepare_obs(
+    parts: SACParts, learner_or_policy: LearnerState | PolicyState, obs: jax.Array
+) -> jax.Array:
+    """Observations as the networks see them."""
+    if parts.normalize_obs:
+        return normalizer.normalize(learner_or_policy.normalizer, obs)
+    return obs
+
+
+# --- acting ----------------------------------------------------------------------------------
+
+
+def init_cache(parts: SACParts, num_envs: int) -> Cache:
+    """The empty cache of N contexts; ``{}`` where the actor keeps none."""
+    pairs = (num_envs, parts.context_length)
+    variables = jax.eval_shape(
+        parts.acting_actor.init,
+        jax.random.key(0),
+        jnp.zeros((*pairs, parts.obs_size)),
+        jnp.zeros((*pairs, parts.action_size)),
+        jnp.zeros(pairs),
+        jnp.zeros(pairs, jnp.int32),
+        jnp.ones(pairs, bool),
+    )
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), variables.get("cache", {}))
+
+
+def act(
+    parts: SACParts, policy: PolicyState, context: Context, key: jax.Array, explore: bool
+) -> Acted:
+    """Chooses actions from contexts, conditioned by Eq. 1 from the target return."""
+    return_to_go = commanded_return_to_go(
+        context.return_so_far, policy.target_return, policy.return_scale
+    )
+    if parts.return_conditioning == "none":
+        return_to_go = jnp.zeros_like(return_to_go)
+    output: Any = parts.acting_actor.apply(
+        {**policy.actor_params, "cache": context.cache},
+        prepare_obs(parts, policy, context.obs),
+        context.action,
+        return_to_go,
+        context.time_step,
+        context.mask,
+        deterministic=not parts.acting_dropout,
+        rngs={"dropout": jax.random.fold_in(key, _DROPOUT_STREAM)},
+        mutable=["cache"],
+    )
+    gaussian, changed = output
+    mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
+    if explore:
+        action = parts.distribution.sample_and_log_prob(key, mean, log_std)[0]
+    else:
+        action = parts.distribution.mode(mean)
+    return Acted(action, dataclasses.replace(context, cache=changed.get("cache", {})))
+
+
+# --- training --------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class WindowPolicies:
+    """π over windows.
+
+    Attributes:
+      now: at the K steps, ``[B, K, A]``.
+      following: after them, ``[B, K, A]``.
+    """
+
+    now: GaussianParams
+    following: GaussianParams
+
+
+def window_policies(
+    parts: SACParts,
+    actor_params: Params,
+    learner: LearnerState,
+    hyper: Hyperparameters,
+    window: Window,
+    key: jax.Array,
+) -> WindowPolicies:
+    """π at the steps of each window and after them, with dropout.
+
+    Args:
+      parts: the static parts.
+      actor_params: the actor's, in place of those of ``learner``.
+      learner: for its normalizer.
+      hyper: numeric settings.
+      window: B windows. Contiguous ones take one causal pass over the K+1 states; scattered ones
+        take two.
+      key: typed PRNG key of the dropout.
+    """
+
+    def gaussian(
+        actor_params: Params,
+        states: Window | States,
+        mask: jax.Array,
+        action: jax.Array,
+        return_to_go: jax.Array,
+        key: jax.Array,
+    ) -> GaussianParams:
+        output: Any = parts.actor.apply(
+            actor_params,
+            prepare_obs(parts, learner, states.obs),
+            action,
+            return_to_go,
+            states.time_step,
+            mask,
+            deterministic=False,
+            rngs={"dropout": key},
+        )
+        return output
+
+    return_to_go = _training_return_to_go(parts, window, hyper)
+    if window.following is None:
+        # The action at the last state is not known, and seen by nobody.
+        action = jnp.pad(window.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
+        both = gaussian(actor_params, window, window.state_mask, action, return_to_go, key)
+        return WindowPolicies(
+            now=jax.tree.map(lambda x: x[:, :-1], both),
+            following=jax.tree.map(lambda x: x[:, 1:], both),
+        )
+    now_key, following_key = jax.random.split(key)
+    following = window.following
+    next_return_to_go = _training_return_to_go(parts, following, hyper)
+    if parts.next_rtg_decrement is not None:
+        next_return_to_go = return_to_go - parts.next_rtg_decrement
+    # tokens="gs" with scattered windows: no actions are looked at.
+    action = window.action
+    return WindowPolicies(
+        now=gaussian(actor_params, window, window.state_mask, action, return_to_go, now_key),
+        following=gaussian(
+            jax.lax.stop_gradient(actor_params),
+            following,
+            following.mask,
+            action,
+            next_return_to_go,
+            following_key,
+        ),
+    )
+
+
+def _training_return_to_go(
+    parts: SACParts, states: Window | States, hyper: Hyperparameters
+) -> jax.Array:
+    """What the return tokens show in training, scaled."""
+    if parts.return_conditioning == "hindsight":
+        return states.return_to_go / hyper.hindsight_scale
+    if parts.return_conditioning == "commanded":
+        return commanded_return_to_go(states.return_so_far, hyper.target_return, hyper.return_scale)
+    return jnp.zeros_like(states.return_to_go)

@@ -1,0 +1,98 @@
+"""The finished episodes in the replay, one table per environment column.
+
+A column's episodes are overwritten in the order in which they were stored, so its table is a ring:
+one episode leaves when its first step is overwritten, one enters when it ends. Episodes shorter
+than K steps never enter, which bounds the table to T / K entries a column.
+
+Letters: N environments, T ring length of a column, E entries of a table, B draws, K steps.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.types import EpisodeTable, Transition
+
+
+def init(num_envs: int, ring_length: int, shortest: int) -> EpisodeTable:
+    """No episodes: ``[N, E]``."""
+    entries = jnp.zeros((num_envs, ring_length // shortest), jnp.int32)
+    none = jnp.zeros(num_envs, jnp.int32)
+    return EpisodeTable(start=entries, length=entries, first=none, count=none)
+
+
+def record(
+    table: EpisodeTable, step: Transition, head: jax.Array, ring_length: int, shortest: int
+) -> EpisodeTable:
+    """The table after ``step`` was written at the ring position ``head`` of every column.
+
+    A last step of bad physics is left out of its episode.
+    """
+    rows, entries = jnp.arange(table.first.shape[0]), table.start.shape[1]
+    # The first step of a stored episode lies where nothing is written before the ring is full.
+    overwritten = (table.count > 0) & (table.start[rows, table.first] == head)
+    first = (table.first + overwritten) % entries
+    count = table.count - overwritten
+
+    length = step.time_step + 1 - step.bad
+    enters = (step.terminated | step.truncated) & (length >= shortest)
+    place = (first + count) % entries
+
+    def write(column: jax.Array, value: jax.Array) -> jax.Array:
+        return column.at[rows, place].set(jnp.where(enters, value, column[rows, place]))
+
+    return EpisodeTable(
+        start=write(table.start, (head - step.time_step) % ring_length),
+        length=write(table.length, length),
+        first=first,
+        count=count + enters,
+    )
+
+
+@flax.struct.dataclass
+class Drawn:
+    """Episodes drawn uniformly, each ``[B]``.
+
+    Attributes:
+      column: int32, the environment.
+      start: int32, ring position of the first step.
+      length: int32, steps.
+      exists: bool, false where the table is empty.
+    """
+
+    column: jax.Array
+    start: jax.Array
+    length: jax.Array
+    exists: jax.Array
+
+
+def draw(table: EpisodeTable, key: jax.Array, batch_size: int) -> Drawn:
+    """Draws B episodes, every one with the same probability."""
+    ends = jnp.cumsum(table.count)
+    number = jax.random.randint(key, (batch_size,), 0, jnp.maximum(ends[-1], 1))
+    column = jnp.minimum(jnp.searchsorted(ends, number, side="right"), ends.size - 1)
+    age_rank = number - (ends - table.count)[column]
+    place = (table.first[column] + age_rank) % table.start.shape[1]
+    return Drawn(
+        column=column,
+        start=table.start[column, place],
+        length=table.length[column, place],
+        exists=jnp.broadcast_to(ends[-1] > 0, (batch_size,)),
+    )
+
+
+def distinct_sorted(key: jax.Array, length: jax.Array, num: int) -> jax.Array:
+    """``num`` different numbers below ``length [B]``, sorted, every set as likely: ``[B, num]``.
+
+    Floyd's algorithm (Bentley and Floyd, 1987); ``length`` must be at least ``num``.
+    """
+    bound = length[:, None] - num + jnp.arange(num)  # [B, num]
+    draws = jax.random.randint(key, bound.shape, 0, bound + 1)
+    chosen = draws[:, :1]
+    for i in range(1, num):
+        new = draws[:, i : i + 1]
+        taken = jnp.any(chosen == new, axis=1, keepdims=True)
+        chosen = jnp.concatenate([chosen, jnp.where(taken, bound[:, i : i + 1], new)], axis=1)
+    return jnp.sort(chosen, axis=1)
