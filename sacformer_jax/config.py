@@ -132,7 +132,7 @@ class ActorConfig:
     actor_dropout: float = 0.1
     """Dropout rate in updates (sacformer)."""
     acting_dropout: bool = False
-    """Leave dropout on in acting and in evaluation."""
+    """Leave dropout on in acting and in evaluation (sacformer)."""
     actor_activation: Activation = "relu"
     """Activation function."""
     head_init_scale: float = 1.0

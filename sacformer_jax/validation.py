@@ -158,6 +158,11 @@ def _check_acting(config: Config) -> None:
         "acting_context=window, or agent=sacformer",
     )
     _require(
+        context.context_length > 1,
+        f"acting_context={context.acting_context!r}: with context_length=1 training never shows "
+        "what came before; use acting_context=window, or context_length of 2 or more",
+    )
+    _require(
         context.acting_context_limit >= context.context_length,
         f"acting_context_limit={context.acting_context_limit}: is below "
         f"context_length={context.context_length}, what training shows; use "

@@ -161,6 +161,28 @@ def test_preset_paper_on_humanoid() -> None:
     assert sac.context.context_length == 1
 
 
+def test_preset_authors_holds_their_programs_values() -> None:
+    flat = Config.from_preset("authors", env="Walker2d").flat()
+    theirs = {
+        "window": "scattered", "return_conditioning": "hindsight", "rtg_discount": 0.99,
+        "hindsight_scale": 500.0, "next_rtg_decrement": 0.002, "target_return": 4_000.0,
+        "return_scale": 1_000.0, "acting_context": "episode", "acting_context_limit": 512,
+        "actor_heads": 1, "actor_activation": "relu", "actor_dropout": 0.1,
+        "acting_dropout": True, "head_init_scale": 1.0, "critic_init": "xavier", "alpha": 0.2,
+        "tune_alpha": False, "buffer_capacity": 1_000_000, "context_length": 6,
+    }  # fmt: skip
+    assert {name: flat[name] for name in theirs} == theirs
+    humanoid = Config.from_preset("authors", env="Humanoid").flat()
+    assert (humanoid["alpha"], humanoid["context_length"]) == (0.05, 10)
+    # 128 episodes of 1,000 steps, or of about 22.
+    for env, steps in {"HalfCheetah": 128_000, "brax:ant": 128_000, "Hopper": 2_900}.items():
+        assert Config.from_preset("authors", env=env).run.prefill_env_steps == steps
+    # SAC knows no windows: it is the paper's.
+    sac = Config.from_preset("authors", env="Hopper", agent="sac").flat()
+    paper = Config.from_preset("paper", env="Hopper", agent="sac").flat()
+    assert {name for name in sac if sac[name] != paper[name]} == {"preset"}
+
+
 def test_what_the_user_gives_wins_over_the_preset() -> None:
     made = Config.from_preset("paper", env="Humanoid", alpha=0.3, context_length=4)
     assert made.sac.alpha == 0.3
@@ -303,6 +325,35 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"target_return": "auto", "return_conditioning": "none"}, "looks at no return"),
     ({"tokens": "gas"}, "tokens='gas'"),
     ({"compute_dtype": "float16"}, "compute_dtype='float16'"),
+    ({"window": "sliding"}, "window='sliding'"),
+    ({"window": "scattered", "tokens": "gsa", "prefill_env_steps": 100}, "tokens=gs"),
+    ({"window": "scattered", "critic": "transformer", "prefill_env_steps": 100}, "critic=mlp"),
+    ({"window": "scattered", "context_length": 51}, "max_episode_steps=50"),
+    ({"prefill_env_steps": 98, "window": "scattered"}, "at least 100"),
+    (
+        {
+            "window": "scattered",
+            "agent": "sac",
+            "context_length": 1,
+            "return_conditioning": "none",
+        },
+        "agent=sac",
+    ),
+    ({"next_rtg_decrement": 0.1}, "return_conditioning=hindsight"),
+    ({"next_rtg_decrement": 0.1, "return_conditioning": "hindsight"}, "window=scattered"),
+    ({"hindsight_scale": 500.0}, "return_conditioning=hindsight"),
+    ({"hindsight_scale": 0.0, "return_conditioning": "hindsight"}, "greater than 0"),
+    ({"hindsight_scale": "none"}, "hindsight_scale='none'"),
+    ({"acting_context": "all"}, "acting_context='all'"),
+    ({"acting_context": "episode", "context_length": 1}, "context_length of 2"),
+    ({"acting_context_limit": 0}, "acting_context_limit=0"),
+    ({"acting_context_limit": 5, "acting_context": "episode"}, "context_length=6"),
+    ({"policy": "categorical"}, "policy='categorical'"),
+    ({"tune_alpha": True, "policy": "deterministic"}, "no entropy"),
+    ({"action_noise": -0.1}, "action_noise=-0.1"),
+    ({"action_noise_clip": 0.0}, "action_noise_clip=0.0"),
+    ({"acting_dropout": True}, "actor_dropout above 0"),
+    ({"critic_init": "zeros"}, "critic_init='zeros'"),
     ({"mjx_preset": "quick"}, "mjx_preset='quick'"),
     ({"mjx_impl": "cpp"}, "mjx_impl='cpp'"),
     ({"prefill_env_steps": 90, "return_conditioning": "hindsight"}, "at least 100"),

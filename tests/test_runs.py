@@ -123,6 +123,35 @@ def test_resuming_equals_never_having_stopped(straight: Outcome, resumed: Outcom
     ]
 
 
+def test_resuming_keeps_the_cache_and_the_table_of_episodes(tmp_path: Path) -> None:
+    """With the authors' settings the train state holds both."""
+    settings = {**TINY, "total_env_steps": 400, "checkpoint_every": 100}
+    settings |= {"return_conditioning": "hindsight", "tune_alpha": False, "actor_dropout": 0.1}
+    straight, stopped = (
+        Config.from_preset("authors", **settings, run_dir=str(tmp_path / name))
+        for name in ("straight", "stopped")
+    )
+    paths = [train(config, quiet=True).path for config in (straight, stopped)]
+    shutil.rmtree(paths[1] / "checkpoints" / "400")
+    resume(paths[1], quiet=True)
+    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
+    policy = load_policy(paths[0], "latest")
+    assert {x.shape for x in jax.tree.leaves(policy.agent.init_cache(1))} == {(1, 1, 100, 8)}
+    observations, rewards = _observations(9), np.arange(9, dtype=np.float32)
+    assert np.isfinite(_predictions(policy, observations, rewards)).all()
+
+
+def test_a_prefill_without_a_long_enough_episode_is_refused(tmp_path: Path) -> None:
+    settings = {**TINY, "window": "scattered", "context_length": 45, "prefill_env_steps": 100}
+    config = Config.from_preset("cpu", **settings, run_dir=str(tmp_path / "run"))
+    with pytest.raises(ConfigError, match=r"prefill_env_steps=100: no episode of at least .*=45"):
+        train(config, quiet=True)
+    # Nothing was saved that would be in the way of another try.
+    changed = config.replace(context_length=6, total_env_steps=300)
+    assert train(changed, quiet=True).env_steps == 300
+
+
 def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed: Outcome) -> None:
     assert resumed.result.evaluations == straight.result.evaluations
     assert not resumed.result.interrupted

@@ -144,6 +144,9 @@ def test_sac_is_the_same_update_with_an_mlp():
         {"tokens": "gsa"},
         {"critic": "transformer", "critic_width": 16},
         {"compute_dtype": "bfloat16"},
+        {"acting_context": "episode"},
+        {"window": "scattered"},
+        {"policy": "deterministic", "tune_alpha": False},
     ],
     ids=lambda options: next(iter(options)),
 )
@@ -155,7 +158,33 @@ def test_each_variant_learns(options):
     actor, critic = (p["params"] for p in (state.learner.actor_params, state.learner.critic_params))
     assert ("embed_action" in actor) == ("tokens" in options)
     assert ("embed_candidate" in critic) == ("critic" in options)
+    assert (state.context.cache != {}) == ("acting_context" in options)
+    assert (state.buffer.episodes is not None) == ("window" in options)
     assert np.median(learning_curve(program, state, chunks=5)[2:]) > LEARNT
+
+
+def test_what_the_authors_program_does_runs_together():
+    config = point_config(
+        window="scattered",
+        return_conditioning="hindsight",
+        hindsight_scale=500.0,
+        next_rtg_decrement=0.002,
+        acting_context="episode",
+        acting_context_limit=12,
+        actor_dropout=0.1,
+        acting_dropout=True,
+        critic_init="xavier",
+        tune_alpha=False,
+        context_length=4,
+        chunk_env_steps=80,
+    )
+    program = make_program(config, point_env(4))
+    state, metrics = program.train_chunk(started(program))
+    assert all(np.isfinite(value) for value in metrics.values())
+    cache = jax.tree.leaves(state.context.cache)
+    assert {x.shape for x in cache} == {(4, 1, 2 * 12, 16)}
+    assert all(np.abs(x).max() > 0 for x in cache)
+    assert int(state.buffer.episodes.count.sum()) == int(state.counters.episodes)
 
 
 class GenerousEnv(PointEnv):
