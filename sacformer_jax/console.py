@@ -93,7 +93,11 @@ class Reporter:
             f"parameters   actor {_count(learner.actor_params)}, "
             f"critics {_count(learner.critic_params)}"
         )
-        self.say(f"buffer       {num_bytes(state.buffer) / 2**20:.1f} MiB")
+        cache = num_bytes(state.context.cache)
+        self.say(
+            f"memory       replay {num_bytes(state.buffer) / 2**20:.1f} MiB"
+            + (f", cache of acting {cache / 2**20:.1f} MiB" if cache else "")
+        )
 
     def start_training(self, env_steps: int, total: int) -> None:
         """Shows the progress bar."""

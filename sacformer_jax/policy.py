@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sacformer_jax import agents, checkpoint
 from sacformer_jax import context as contexts
@@ -43,6 +43,8 @@ class Policy:
       >>> while True:
       ...     action = policy.predict(obs, reward)
       ...     obs, reward, terminated, truncated, info = env.step(action)
+
+    For a vector environment, ``policy.reset(num_envs)`` and ``episode_start`` in ``predict``.
     """
 
     def __init__(self, config: Config, spec: EnvSpec, agent: Agent, state: PolicyState):
@@ -50,37 +52,56 @@ class Policy:
         self._act = jax.jit(self._acting, donate_argnums=1)
         self.reset()
 
-    def reset(self) -> None:
-        """Forgets the episode so far; call it at each ``env.reset()``."""
+    def reset(self, num_envs: int | None = None) -> None:
+        """Forgets everything so far; call it at ``env.reset()``.
+
+        Args:
+          num_envs: N of a vector environment; None for a single one.
+        """
         spec, context_length = self.spec, self.config.context.context_length
-        cache = self.agent.init_cache(1)
-        context = contexts.empty(1, context_length, spec.obs_size, spec.action_size, cache)
-        last = Acted(action=jnp.zeros((1, spec.action_size)), context=context)
+        self._num_envs, size = num_envs, 1 if num_envs is None else num_envs
+        cache = self.agent.init_cache(size)
+        context = contexts.empty(size, context_length, spec.obs_size, spec.action_size, cache)
+        last = Acted(action=jnp.zeros((size, spec.action_size)), context=context)
         self._memory = _Memory(last, jax.random.key(0))
         self._first = True
 
-    def predict(self, obs: Any, reward: float = 0.0) -> np.ndarray:
-        """The mean action for an observation.
+    def predict(
+        self, obs: ArrayLike, reward: ArrayLike = 0.0, episode_start: ArrayLike = False
+    ) -> np.ndarray:
+        """The mean action for an observation, or for one of each environment.
 
         Args:
-          obs: ``[O]``.
-          reward: what the previous step gave; ignored on the first call after ``reset``.
+          obs: ``[O]``, or ``[N, O]`` after ``reset(N)``.
+          reward: what the previous step gave, scalar or ``[N]``; ignored where an episode starts.
             The previous step is taken to have been done with the action returned.
+          episode_start: bool, scalar or ``[N]``: where ``obs`` is the first of a new episode. On
+            the first call after ``reset`` it is everywhere.
 
         Returns:
-          ``[A]`` float32, within the action bounds.
+          ``[A]`` or ``[N, A]`` float32, within the action bounds.
 
         Raises:
-          ValueError: ``obs`` has another shape.
+          ValueError: an argument has another shape.
         """
+        lead = () if self._num_envs is None else (self._num_envs,)
         values = np.asarray(obs, np.float32)
-        if values.shape != (self.spec.obs_size,):
-            raise ValueError(f"obs of shape {values.shape}: must be ({self.spec.obs_size},)")
-        self._memory = self._act(
-            self.state, self._memory, values, np.float32(reward), np.bool_(self._first)
-        )
+        expected = (*lead, self.spec.obs_size)
+        if values.shape != expected:
+            remedy = "" if values.ndim == len(expected) else "; reset(num_envs) sets how many"
+            raise ValueError(f"obs of shape {values.shape}: must be {expected}{remedy}")
+        given = {
+            "reward": np.asarray(reward, np.float32),
+            "episode_start": np.asarray(episode_start, bool) | self._first,
+        }
+        size = self._memory.last.action.shape[0]
+        for name, value in given.items():
+            if value.shape not in ((), lead):
+                raise ValueError(f"{name} of shape {value.shape}: must be {lead}, or a scalar")
+            given[name] = np.broadcast_to(value, size)
+        self._memory = self._act(self.state, self._memory, values.reshape(size, -1), **given)
         self._first = False
-        return np.array(self._memory.last.action[0])
+        return np.array(self._memory.last.action).reshape(*lead, -1)
 
     def _acting(
         self,
@@ -88,11 +109,11 @@ class Policy:
         memory: _Memory,
         obs: jax.Array,
         reward: jax.Array,
-        first: jax.Array,
+        episode_start: jax.Array,
     ) -> _Memory:
         key, act_key = jax.random.split(memory.key)
         # An episode's first state enters like one after a reset.
-        context = contexts.advance(memory.last, obs[None], reward[None], first[None])
+        context = contexts.advance(memory.last, obs, reward, episode_start)
         return _Memory(self.agent.act(state, context, act_key, explore=False), key)
 
 

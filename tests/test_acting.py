@@ -171,6 +171,43 @@ def test_a_policy_object_acts_on_its_whole_episode():
         np.testing.assert_allclose(actions, expected, atol=1e-5)
 
 
+def test_a_policy_object_acts_in_many_environments_at_once():
+    """Each as if alone, whenever their episodes start."""
+    config = acting_config()
+    agent, spec, state = make_agent(config, 60)
+    policy = Policy(config, spec, agent, state)
+    rng = np.random.default_rng(2)
+    obs = rng.normal(size=(30, 3, OBS)).astype(np.float32)
+    rewards = rng.normal(size=(30, 3)).astype(np.float32)
+    starts = np.zeros((30, 3), bool)
+    starts[12, 1] = starts[20, 1] = starts[7, 2] = True
+    policy.reset(3)
+    together = np.stack([policy.predict(obs[t], rewards[t - 1], starts[t]) for t in range(30)])
+    assert together.shape == (30, 3, ACT)
+    for env in range(3):
+        for t in range(30):
+            if t == 0 or starts[t, env]:
+                policy.reset()
+            alone = policy.predict(obs[t, env], rewards[t - 1, env])
+            assert alone.shape == (ACT,)
+            np.testing.assert_allclose(together[t, env], alone, atol=1e-5)
+    # A single environment's episodes may be told apart without a reset, too.
+    policy.reset()
+    policy.predict(obs[0, 0])
+    np.testing.assert_allclose(
+        policy.predict(obs[7, 2], 5.0, episode_start=True), together[7, 2], atol=1e-5
+    )
+    policy.reset(3)
+    for arguments, message in (
+        ((obs[0, 0],), r"obs of shape \(3,\): must be \(3, 3\); reset"),
+        ((obs[0, :2],), r"obs of shape \(2, 3\): must be \(3, 3\)$"),
+        ((obs[0], np.zeros(2)), r"reward of shape \(2,\): must be \(3,\), or a scalar"),
+        ((obs[0], 0.0, [True]), r"episode_start of shape \(1,\): must be \(3,\), or a scalar"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            policy.predict(*arguments)
+
+
 class HurriedEnv(PointEnv):
     """Terminates near the origin, so that episodes differ in length."""
 
