@@ -50,6 +50,7 @@ class Policy:
     def __init__(self, config: Config, spec: EnvSpec, agent: Agent, state: PolicyState):
         self.config, self.spec, self.agent, self.state = config, spec, agent, state
         self._act = jax.jit(self._acting, donate_argnums=1)
+        self._shapes: dict[int, Acted] = {}
         self.reset()
 
     def reset(self, num_envs: int | None = None) -> None:
@@ -57,14 +58,29 @@ class Policy:
 
         Args:
           num_envs: N of a vector environment; None for a single one.
+
+        Raises:
+          ValueError: ``num_envs`` is below 1.
         """
-        spec, context_length = self.spec, self.config.context.context_length
-        self._num_envs, size = num_envs, 1 if num_envs is None else num_envs
-        cache = self.agent.init_cache(size)
-        context = contexts.empty(size, context_length, spec.obs_size, spec.action_size, cache)
-        last = Acted(action=jnp.zeros((size, spec.action_size)), context=context)
-        self._memory = _Memory(last, jax.random.key(0))
-        self._first = True
+        if num_envs is not None and num_envs < 1:
+            raise ValueError(f"num_envs={num_envs}: must be at least 1, or None")
+        self._num_envs, self._first = num_envs, True
+        nothing = self._nothing(1 if num_envs is None else num_envs)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), nothing)
+        self._memory = _Memory(zeros, jax.random.key(0))
+
+    def _nothing(self, size: int) -> Acted:
+        """Shapes of a last step of ``size`` environments; all zero, it is none at all."""
+        if size not in self._shapes:
+            spec, length = self.spec, self.config.context.context_length
+
+            def last() -> Acted:
+                cache = self.agent.init_cache(size)
+                context = contexts.empty(size, length, spec.obs_size, spec.action_size, cache)
+                return Acted(action=jnp.zeros((size, spec.action_size)), context=context)
+
+            self._shapes[size] = jax.eval_shape(last)
+        return self._shapes[size]
 
     def predict(
         self, obs: ArrayLike, reward: ArrayLike = 0.0, episode_start: ArrayLike = False

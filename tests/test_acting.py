@@ -169,6 +169,7 @@ def test_a_policy_object_acts_on_its_whole_episode():
         )
         expected = all_at_once(config, spec, state, obs, actions, rewards, 60)
         np.testing.assert_allclose(actions, expected, atol=1e-5)
+    assert policy._act._cache_size() == 1  # the same program, whatever the step
 
 
 def test_a_policy_object_acts_in_many_environments_at_once():
@@ -197,6 +198,8 @@ def test_a_policy_object_acts_in_many_environments_at_once():
     np.testing.assert_allclose(
         policy.predict(obs[7, 2], 5.0, episode_start=True), together[7, 2], atol=1e-5
     )
+    with pytest.raises(ValueError, match="num_envs=0: must be at least 1"):
+        policy.reset(0)
     policy.reset(3)
     for arguments, message in (
         ((obs[0, 0],), r"obs of shape \(3,\): must be \(3, 3\); reset"),
