@@ -13,6 +13,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def acting(num_envs: int, acting_context: str) -> dict[str, float]:
     for first in range(0, EPISODE, STRETCH):
         after = jax.block_until_ready(stretch(context))  # compiles, the first time
         if first in (0, EPISODE // 2, EPISODE - STRETCH):
-            costs[f"from_step_{first}"] = milliseconds(lambda c=context: stretch(c), STRETCH)
+            costs[f"from_step_{first}"] = milliseconds(partial(stretch, context), STRETCH)
         context = after
     return costs
 
@@ -87,7 +88,7 @@ def computed_anew(num_envs: int) -> float:
     params = jax.jit(actor.init)(jax.random.key(0), *inputs)
     apply = jax.jit(actor.apply)
     jax.block_until_ready(apply(params, *inputs))
-    return milliseconds(lambda: apply(params, *inputs), 1, repetitions=3)
+    return milliseconds(partial(apply, params, *inputs), 1, repetitions=3)
 
 
 def main() -> None:
