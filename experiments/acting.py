@@ -1,8 +1,8 @@
 """What acting costs: on the window, on the whole episode through the cache, and computed anew.
 
 Milliseconds a step of the actor alone, at the paper's size on HalfCheetah (17 observations, 6
-actions), the median over stretches of 100 steps at the beginning, middle and end of an episode of
-1,000. Writes results/acting.json.
+actions): stretches of 100 steps at the beginning, middle and end of an episode of 1,000, the median
+of five repetitions of each. Writes results/acting.json.
 
 python experiments/acting.py
 """

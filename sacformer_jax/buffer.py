@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax import episodes
-from sacformer_jax.config import ConfigError
+from sacformer_jax.config import ConfigError, shortest_column
 from sacformer_jax.context import all_discounted_suffix_sums, discounted_suffix_sums
 from sacformer_jax.types import BufferState, States, Transition, Window
 
@@ -38,7 +38,7 @@ class TrajectoryBuffer:
       scattered: whether windows are scattered instead of contiguous.
 
     Raises:
-      ConfigError: a column cannot hold the longest episode plus a window.
+      ConfigError: a column is shorter than :func:`shortest_column`.
     """
 
     num_envs: int
@@ -51,12 +51,12 @@ class TrajectoryBuffer:
     scattered: bool = False
 
     def __post_init__(self) -> None:
-        needed = self.max_episode_steps + self.context_length
+        needed = shortest_column(self.max_episode_steps, self.context_length, self.scattered)
         if self.length < needed:
             raise ConfigError(
                 f"buffer_capacity={self.length * self.num_envs} over num_envs={self.num_envs} "
-                f"gives {self.length} steps each: must be at least max_episode_steps + "
-                f"context_length = {needed} each, so buffer_capacity >= {needed * self.num_envs}"
+                f"gives {self.length} steps each: must be at least {needed} each, so "
+                f"buffer_capacity >= {needed * self.num_envs}"
             )
 
     def init(self) -> BufferState:

@@ -206,7 +206,8 @@ def _describe_run(parsed: DescribeArgs) -> int:
 def _print_config(resolved: Resolved) -> None:
     for name, value in resolved.config.flat().items():
         shown = repr(value) if value in ("", None) else str(value)
-        print(f"{name:<24}{shown:<15} {resolved.sources[name]}")
+        # A run of an earlier version knows no source of later fields: they are at their defaults.
+        print(f"{name:<24}{shown:<15} {resolved.sources.get(name, 'default')}")
 
 
 if __name__ == "__main__":

@@ -7,12 +7,11 @@ Every field name is unique over all sections, so a field can be given by its bar
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import math
-import types as python_types
 import typing
 from fractions import Fraction
 from typing import Any, Literal
+
+from sacformer_jax.values import ConfigError, coerced, unknown
 
 AgentName = Literal["sacformer", "sac"]
 PresetName = Literal["cpu", "paper", "authors"]
@@ -29,10 +28,6 @@ PolicyKind = Literal["gaussian", "deterministic"]
 KernelInit = Literal["lecun", "xavier"]
 CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
-
-
-class ConfigError(ValueError):
-    """A setting that cannot work; the message names field, value and what would be right."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,8 +90,8 @@ class ContextConfig:
     """K: (return-to-go, state) pairs the actor sees, in training and in acting on the window."""
     acting_context: ActingContext = "window"
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
-    acting_context_limit: int = 1000
-    """Newest pairs seen at most with acting_context=episode."""
+    acting_context_limit: int | None = None
+    """Newest pairs seen at most with acting_context=episode; None: all."""
     window: WindowKind = "contiguous"
     """K steps of a window: contiguous, or drawn from one finished episode and sorted."""
     return_conditioning: Conditioning = "hindsight"
@@ -106,9 +101,9 @@ class ContextConfig:
     return_scale: float = 1_000.0
     """Every return-to-go is divided by this."""
     hindsight_scale: float | None = None
-    """Divides hindsight return-to-go instead of return_scale; none: the same."""
+    """Divides hindsight return-to-go instead of return_scale; None: the same."""
     next_rtg_decrement: float | None = None
-    """Scattered windows: hindsight return-to-go at t+1 is that of t less this; none: its own."""
+    """Scattered windows: hindsight return-to-go at t+1 is that of t less this; None: its own."""
     rtg_discount: float = 0.99
     """Discount of hindsight return-to-go; 1 for none."""
     tokens: Tokens = "gs"
@@ -246,9 +241,9 @@ class Config:
         changes: dict[str, dict[str, Any]] = {}
         for name, value in fields.items():
             if name not in places:
-                raise ConfigError(_unknown("field", name, places))
+                raise ConfigError(unknown("field", name, places))
             section, kind = places[name]
-            changes.setdefault(section, {})[name] = _coerced(name, value, kind)
+            changes.setdefault(section, {})[name] = coerced(name, value, kind)
         config = dataclasses.replace(self, **changes.pop("", {}))
         for section, values in changes.items():
             changed = dataclasses.replace(getattr(config, section), **values)
@@ -327,45 +322,9 @@ def field_places() -> dict[str, tuple[str, Any]]:
     return places
 
 
-def _unknown(what: str, name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1)
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
-    return f"{what} {name!r} does not exist; {hint}"
+def shortest_column(max_episode_steps: int, context_length: int, scattered: bool) -> int:
+    """Steps that each environment's column must hold: the longest episode and a window.
 
-
-def _alternatives(union: Any) -> tuple[tuple[Any, ...], Any]:
-    """The words (or None) and the one number type that a union allows."""
-    words: list[Any] = []
-    for member in typing.get_args(union):
-        if typing.get_origin(member) is Literal:
-            words += typing.get_args(member)
-        elif member is type(None):
-            words.append(None)
-        else:
-            kind = member
-    return tuple(words), kind
-
-
-def _coerced(name: str, value: Any, kind: Any) -> Any:
-    """``value`` as the field's type, where nothing is lost by it."""
-    if isinstance(kind, python_types.UnionType) or typing.get_origin(kind) is typing.Union:
-        words, kind = _alternatives(kind)
-        if value is None or isinstance(value, str):
-            if value in words:
-                return value
-            other = "".join(f", or {word!r}" for word in words)
-            raise ConfigError(f"{name}={value!r}: must be of type {kind.__name__}{other}")
-    if typing.get_origin(kind) is Literal:
-        choices = typing.get_args(kind)
-        if value not in choices:
-            raise ConfigError(f"{name}={value!r}: must be one of {', '.join(map(str, choices))}")
-        return value
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) < 2**1000 else math.inf
-    if kind is int and isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ConfigError(f"{name}={value!r}: must be of type {kind.__name__}")
-    if kind is float and not math.isfinite(value):
-        raise ConfigError(f"{name}={value!r}: must be a finite number")
-    return value
+    For scattered windows two of the longest episodes, so that one is whole at any time.
+    """
+    return max_episode_steps + (max_episode_steps if scattered else context_length)

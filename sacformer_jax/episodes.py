@@ -18,9 +18,14 @@ from sacformer_jax.types import EpisodeTable, Transition
 
 def init(num_envs: int, ring_length: int, shortest: int) -> EpisodeTable:
     """No episodes: ``[N, E]``."""
-    entries = jnp.zeros((num_envs, ring_length // shortest), jnp.int32)
-    none = jnp.zeros(num_envs, jnp.int32)
-    return EpisodeTable(start=entries, length=entries, first=none, count=none)
+    shape = (num_envs, ring_length // shortest)
+    # Arrays of their own, never aliases: they are donated.
+    return EpisodeTable(
+        start=jnp.zeros(shape, jnp.int32),
+        length=jnp.zeros(shape, jnp.int32),
+        first=jnp.zeros(num_envs, jnp.int32),
+        count=jnp.zeros(num_envs, jnp.int32),
+    )
 
 
 def record(

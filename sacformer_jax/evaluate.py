@@ -1,4 +1,4 @@
-"""Evaluation: jitted on our environments, and in a real Gymnasium environment."""
+"""Evaluation on our environments, jitted."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.cache import cache_places
 from sacformer_jax.config import Tokens
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.transformer import (
@@ -181,41 +181,6 @@ class TransformerActor(nn.Module):
         new_tokens = tokens[:, n * (n - 2) + 2 - n :][:, :n]  # [B, n, D]
         trunk = Transformer(self.config, kept=(n - 1, n), name="trunk")
         return trunk(new_tokens, places.mask, deterministic, places.positions)
-
-
-@flax.struct.dataclass
-class CachePlaces:
-    """Where the n newest tokens of a running episode go in the cache, and what they attend to.
-
-    Attributes:
-      positions: int32 ``[B, n]``.
-      mask: bool ``[B, n, C]``.
-    """
-
-    positions: jax.Array
-    mask: jax.Array
-
-
-def cache_places(time_step: jax.Array, num_tokens: int, context_length: int) -> CachePlaces:
-    """The places of an episode's tokens ``(G_0, S_0, [A_0,] G_1, …)`` in a ring.
-
-    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with actions
-    one more, since A_{t-1} comes with step t and sees a step that S_t no longer does.
-
-    Args:
-      time_step: int32 ``[B]``, t of the newest state.
-      num_tokens: n, 2 or 3 a step; the newest are ``G_t, S_t``, after ``A_{t-1}`` with 3.
-      context_length: how many steps a token sees, its own included.
-    """
-    n = num_tokens
-    size = (context_length + n - 2) * n
-    new = time_step[:, None] * n + jnp.arange(2 - n, 2)  # [B, n]
-    newest = new[:, -1:]
-    # The number of the token that lies at each place; below 0 it is none of this episode.
-    held = newest - (newest - jnp.arange(size)) % size  # [B, C]
-    query, key = new[:, :, None], held[:, None, :]
-    visible = (key >= 0) & (key <= query) & (query // n - key // n < context_length)
-    return CachePlaces(positions=new % size, mask=visible)
 
 
 class MLP(nn.Module):

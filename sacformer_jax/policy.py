@@ -56,6 +56,9 @@ class Policy:
     def reset(self, num_envs: int | None = None) -> None:
         """Forgets everything so far; call it at ``env.reset()``.
 
+        Where dropout is on in acting, its masks start anew from the same key, so that an episode
+        can be repeated.
+
         Args:
           num_envs: N of a vector environment; None for a single one.
 

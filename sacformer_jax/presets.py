@@ -71,22 +71,22 @@ _PAPER = (
     ),
 )
 
-# 128 episodes' worth of steps; lengths under random actions measured over 320,000 steps each:
-# Hopper 22, Walker2d 21, Ant 155, Humanoid 24.
+# Their updates start with 128 finished episodes. Mean length under random actions, measured over
+# 320,000 steps each: Hopper 22, Walker2d 21, Ant 155, Humanoid 24.
 _AUTHORS_PREFILL = tuple(
     Layer(
-        "authors' program: updates start with 128 finished episodes",
+        f"authors' program: about 128 episodes {what}",
         {"prefill_env_steps": steps},
         agent="sacformer",
         env=env,
     )
-    for env, steps in {
-        None: 128_000,
-        "Hopper": 2_900,
-        "Walker2d": 2_800,
-        "Ant": 19_800,
-        "Humanoid": 3_200,
-    }.items()
+    for env, steps, what in (
+        (None, 128_000, "of 1,000 steps"),
+        ("Hopper", 2_900, "of random actions"),
+        ("Walker2d", 2_800, "of random actions"),
+        ("Ant", 19_800, "of random actions"),
+        ("Humanoid", 3_200, "of random actions"),
+    )
 )
 
 PRESETS: dict[str, tuple[Layer, ...]] = {
@@ -99,7 +99,7 @@ PRESETS: dict[str, tuple[Layer, ...]] = {
             agent="sacformer",
         ),
         Layer(
-            "authors' program: acting starts from 4, minus reward / 1000, on up to 512 steps",
+            "authors' program: acts from 4, minus reward / 1000, on up to 512 steps",
             {"target_return": 4_000.0, "return_scale": 1_000.0, "acting_context_limit": 512},
             agent="sacformer",
         ),

@@ -26,8 +26,8 @@ from sacformer_jax.presets import resolve
 from sacformer_jax.train import Program, make_program, policy_of
 from sacformer_jax.types import TrainState
 
-_EVALUATION_STREAM = 1
-"""Folded into the seed: evaluation episodes draw nothing from the training keys."""
+_EVALUATION_STREAM = 2**31
+"""Folded into the seed's key: beyond the small numbers by which training splits it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,8 @@ def train(config: Config, sources: dict[str, str] | None = None, quiet: bool = F
       quiet: print nothing.
 
     Raises:
-      ConfigError: a setting cannot work; nothing was written.
+      ConfigError: a setting cannot work; nothing was written, but for ``config.json`` where prefill
+        turns out too short (the folder may be used again).
       CheckpointError: the folder holds a run already or cannot be written.
     """
     program = make_program(config)

@@ -7,6 +7,7 @@ One iteration collects a few steps of all environments and then makes the gradie
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -29,6 +30,9 @@ from sacformer_jax.types import (
 )
 
 Metrics = dict[str, jax.Array]
+
+_LOOKING_STREAM = 2**31
+"""Folded into a key of prefill, apart from the random action."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +163,7 @@ class _TrainingFunctions:
         def random_action(context: Context, key: jax.Array) -> Acted:
             if self.config.context.acting_context == "episode":
                 # The policy looks on, so that it knows the episodes that it will go on with.
-                policy, look_key = policy_of(state), jax.random.fold_in(key, 1)
+                policy, look_key = policy_of(state), jax.random.fold_in(key, _LOOKING_STREAM)
                 context = self.agent.act(policy, context, look_key, explore=False).context
             return Acted(self.env.random_action(key), context)
 
@@ -197,7 +201,14 @@ class _TrainingFunctions:
         learner, metrics = jax.lax.scan(
             one_update, state.learner, jax.random.split(updates_key, num_updates)
         )
-        counters = dataclasses.replace(state.counters, updates=state.counters.updates + num_updates)
+        if self.buffer.scattered:
+            # Episodes shorter than K may leave nothing to learn from; momentum must not move on.
+            learnt = self.buffer.can_sample(state.buffer)
+            learner = jax.tree.map(partial(jnp.where, learnt), learner, state.learner)
+            done = jnp.where(learnt, num_updates, 0)
+        else:
+            done = jnp.int32(num_updates)
+        counters = dataclasses.replace(state.counters, updates=state.counters.updates + done)
         return dataclasses.replace(state, learner=learner, counters=counters, key=key), (
             stats,
             metrics,

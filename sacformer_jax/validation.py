@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sacformer_jax.config import Config, ConfigError
+from sacformer_jax.config import Config, ConfigError, shortest_column
 
 _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width", "critic_heads", "acting_context_limit",
+    "critic_width", "critic_heads",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
@@ -61,8 +61,8 @@ def _check_actor(config: Config) -> None:
     )
     _require(
         not actor.acting_dropout or (config.agent != "sac" and actor.actor_dropout > 0),
-        "acting_dropout=True: there is no dropout to leave on; use agent=sacformer with "
-        "actor_dropout above 0",
+        "acting_dropout=True: there is no dropout to leave on; use acting_dropout=False, or "
+        "agent=sacformer with actor_dropout above 0",
     )
     if config.agent == "sac":
         _require(
@@ -107,7 +107,7 @@ def _check_window(config: Config) -> None:
         _require(
             value is None or context.return_conditioning == "hindsight",
             f"{name}={value}: is for return_conditioning=hindsight, not "
-            f"{context.return_conditioning}; leave it out",
+            f"{context.return_conditioning}; use {name}=None, or hindsight",
         )
     _require(
         scale is None or bool(np.float32(scale) > 0),
@@ -116,8 +116,8 @@ def _check_window(config: Config) -> None:
     if context.window == "contiguous":
         _require(
             decrement is None,
-            f"next_rtg_decrement={decrement}: window=contiguous shows what followed; leave it "
-            "out, or use window=scattered",
+            f"next_rtg_decrement={decrement}: window=contiguous shows what followed; use "
+            "next_rtg_decrement=None, or window=scattered",
         )
         return
     reasons = {
@@ -131,7 +131,7 @@ def _check_window(config: Config) -> None:
             config.critic.critic == "mlp"
         ),
         f"context_length={context.context_length} different steps cannot be drawn from episodes "
-        f"of at most max_episode_steps={config.task.max_episode_steps}": (
+        f"of at most max_episode_steps={config.task.max_episode_steps}; use a smaller K": (
             context.context_length <= config.task.max_episode_steps
         ),
     }
@@ -149,7 +149,8 @@ def _check_target_return(config: Config) -> None:
 
 
 def _check_acting(config: Config) -> None:
-    context = config.context
+    context, limit = config.context, config.context.acting_context_limit
+    _require(limit is None or limit >= 1, f"acting_context_limit={limit}: must be at least 1")
     if context.acting_context == "window":
         return
     _require(
@@ -163,8 +164,8 @@ def _check_acting(config: Config) -> None:
         "what came before; use acting_context=window, or context_length of 2 or more",
     )
     _require(
-        context.acting_context_limit >= context.context_length,
-        f"acting_context_limit={context.acting_context_limit}: is below "
+        limit is None or limit >= context.context_length,
+        f"acting_context_limit={limit}: is below "
         f"context_length={context.context_length}, what training shows; use "
         f"{context.context_length} or more",
     )
@@ -186,6 +187,11 @@ def _check_critic(config: Config) -> None:
     _require(
         critic.critic_width % critic.critic_heads == 0,
         f"critic_heads={critic.critic_heads}: must divide critic_width={critic.critic_width}",
+    )
+    _require(
+        critic.critic_init == "lecun",
+        f"critic_init={critic.critic_init!r}: is for critic=mlp; a transformer has its own; use "
+        "critic_init=lecun",
     )
     _require(
         not critic.critic_layer_norm,
@@ -230,9 +236,13 @@ def _check_steps(config: Config) -> None:
         f"prefill_env_steps={run.prefill_env_steps}: must be at least {needed * task.num_envs} "
         f"({needed} for each of num_envs={task.num_envs}), so that there is something to sample",
     )
-    least = (task.max_episode_steps + config.context.context_length) * task.num_envs
+    scattered = config.context.window == "scattered"
+    least = task.num_envs * shortest_column(
+        task.max_episode_steps, config.context.context_length, scattered
+    )
+    what = "two of the longest episodes" if scattered else "the longest episode and a window"
     _require(
         replay.buffer_capacity >= least,
         f"buffer_capacity={replay.buffer_capacity}: must be at least {least}, so that each of "
-        f"num_envs={task.num_envs} holds the longest episode and a window",
+        f"num_envs={task.num_envs} holds {what}",
     )

@@ -14,11 +14,12 @@ from probe import EPISODE, PointEnv, point_config, point_env
 
 from sacformer_jax import agents, rollout
 from sacformer_jax import context as contexts
+from sacformer_jax.cache import cache_places
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.context import commanded_return_to_go
 from sacformer_jax.envs.core import EnvSpec, VectorEnv
 from sacformer_jax.evaluate import make_evaluator
-from sacformer_jax.networks import TransformerActor, cache_places
+from sacformer_jax.networks import TransformerActor
 from sacformer_jax.policy import Policy
 from sacformer_jax.train import hyperparameters, make_program, policy_of, policy_state
 from sacformer_jax.transformer import TransformerConfig
@@ -73,7 +74,7 @@ def make_agent(config: Config, episode_steps: int):
     """An agent, and a policy whose parameters and normalizer are far from their start."""
     spec = EnvSpec("test", OBS, ACT, (-2.0, -1.0), (1.0, 3.0), episode_steps, "jax", "a test")
     agent = agents.make(config, spec)
-    learner = agent.init(jax.random.key(0))
+    learner = jax.jit(agent.init)(jax.random.key(0))
     normalizer = dataclasses.replace(
         learner.normalizer,
         count=jnp.int32(10),
@@ -277,6 +278,18 @@ def test_it_trains_and_repeats(program):
     np.testing.assert_array_equal(trained(), trained())
 
 
+def test_the_cache_keeps_bfloat16_products_in_bfloat16():
+    config = acting_config(compute_dtype="bfloat16")
+    agent, spec, state = make_agent(config, 30)
+    assert all(x.dtype == jnp.bfloat16 for x in jax.tree.leaves(agent.init_cache(2)))
+    obs = np.random.default_rng(0).normal(size=(30, OBS)).astype(np.float32)
+    rewards, policy = np.ones(30, np.float32), Policy(config, spec, agent, state)
+    actions = np.stack([policy.predict(obs[t], rewards[t]) for t in range(30)])
+    expected = all_at_once(config, spec, state, obs, actions, rewards, 30)  # in float32
+    np.testing.assert_allclose(actions, expected, atol=0.05)
+    assert np.abs(actions - expected).max() > 1e-4
+
+
 @pytest.mark.parametrize("acting_context", ["window", "episode"])
 def test_dropout_in_acting_is_drawn_from_the_key(acting_context):
     settings = {"acting_context": acting_context, "actor_dropout": 0.4}
@@ -299,11 +312,43 @@ def test_a_policy_with_dropout_draws_anew_at_every_step_and_repeats_after_reset(
     config = acting_config(acting_context="window", acting_dropout=True, actor_dropout=0.4)
     agent, spec, state = make_agent(config, 30)
     policy = Policy(config, spec, agent, state)
-    actions = [policy.predict(np.ones(OBS)) for _ in range(2)]
-    policy.reset()
-    np.testing.assert_array_equal(policy.predict(np.ones(OBS)), actions[0])
-    other = Policy(config, spec, agent, state)
-    np.testing.assert_array_equal(other.predict(np.ones(OBS)), actions[0])
+    obs, nothing = jnp.ones((1, OBS)), jnp.zeros(1)
+    # The two steps by hand, with a key of their own each.
+    key, first_key = jax.random.split(jax.random.key(0))
+    _, second_key = jax.random.split(key)
+    act = jax.jit(agent.act, static_argnames="explore")
+    first = act(state, contexts.start(obs, 4, ACT, {}), first_key, explore=False)
+    context = contexts.advance(first, obs, nothing, nothing > 0)
+    second, stale = (act(state, context, k, explore=False) for k in (second_key, first_key))
+    assert np.abs(second.action - stale.action).max() > 1e-3
+    for _ in range(2):
+        for acted in (first, second):
+            np.testing.assert_allclose(policy.predict(obs[0]), acted.action[0], atol=1e-5)
+        policy.reset()
+
+
+def test_evaluation_draws_its_dropout_from_its_key_at_every_step():
+    """In a task without any other chance: returns differ only by the masks."""
+    env = VectorEnv(SameStartEnv(), 3)
+    config = point_config(actor_dropout=0.4, acting_dropout=True, head_init_scale=1.0)
+    agent = agents.make(config, env.spec)
+    learner = jax.jit(agent.init)(jax.random.key(0))
+    params = randomized(learner.actor_params, scale=0.3)
+    policy = policy_state(
+        dataclasses.replace(learner, actor_params=params), hyperparameters(config, 1)
+    )
+    evaluate = make_evaluator(env, agent, 2)
+    returns = [np.asarray(evaluate(policy, jax.random.key(seed)).returns) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(returns[0], returns[1])
+    assert (returns[0] != returns[2]).all()
+    assert len(set(returns[0].tolist())) == 3
+
+
+class SameStartEnv(PointEnv):
+    """Every episode begins at the same place."""
+
+    def reset(self, key):
+        return super().reset(jax.random.key(0))
 
 
 @pytest.mark.parametrize(

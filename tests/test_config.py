@@ -339,6 +339,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
         },
         "agent=sac",
     ),
+    ({"buffer_capacity": 199, "window": "scattered", "prefill_env_steps": 100}, "at least 200"),
+    ({"critic_init": "xavier", "critic": "transformer"}, "critic=mlp"),
     ({"next_rtg_decrement": 0.1}, "return_conditioning=hindsight"),
     ({"next_rtg_decrement": 0.1, "return_conditioning": "hindsight"}, "window=scattered"),
     ({"hindsight_scale": 500.0}, "return_conditioning=hindsight"),

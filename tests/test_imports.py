@@ -15,11 +15,11 @@ PACKAGE = "sacformer_jax"
 # Each module may import only from earlier lines, and from its own line where that is a folder or
 # the settings. A new module needs a place here.
 ARROW: tuple[tuple[str, ...], ...] = (
-    ("version", "cores"),
+    ("version", "cores", "values"),
     ("config", "validation", "presets"),
     ("envs",),
     ("types",),
-    ("context", "transformer", "distributions", "normalizer"),
+    ("context", "transformer", "distributions", "normalizer", "cache", "episodes"),
     ("networks",),
     ("critics",),
     ("buffer",),

@@ -210,6 +210,31 @@ def test_vmapped_buffers_equal_single_ones():
                 np.testing.assert_allclose(a, b[i], rtol=1e-6)
 
 
+def test_a_fresh_replay_can_be_donated():
+    buffer = make(2)
+    add = jax.jit(buffer.add, donate_argnums=0)
+    step = jax.tree.map(lambda x: x[0], transitions(simulate(0, 1)))
+    assert int(add(buffer.init(), step).size) == 1  # an alias would be donated twice
+
+
+def test_the_shortest_ring_always_holds_an_episode():
+    """All columns in step, every episode as long as can be: the worst case."""
+    buffer = make(5, length=2 * MAX_EPISODE)
+    with pytest.raises(ValueError, match=r"must be at least 14 each"):
+        make(5, length=2 * MAX_EPISODE - 1)
+    columns = simulate(0, 5 * MAX_EPISODE)
+    for steps in columns:
+        for i, step in enumerate(steps):
+            last = i % MAX_EPISODE == MAX_EPISODE - 1
+            steps[i] = dataclasses.replace(
+                step, time_step=i % MAX_EPISODE, truncated=last, terminated=False, bad=False
+            )
+    add, state, every_step = jax.jit(buffer.add), buffer.init(), transitions(columns)
+    for now in range(5 * MAX_EPISODE):
+        state = add(state, jax.tree.map(lambda x, now=now: x[now], every_step))
+        assert bool(buffer.can_sample(state)) == (now >= MAX_EPISODE - 1), now
+
+
 def test_the_table_takes_little_memory():
     plain = TrajectoryBuffer(4, 5_000, 17, 6, 6, 1000)
     scattered = dataclasses.replace(plain, scattered=True)

@@ -87,6 +87,55 @@ def test_counts_and_compiles_once(program):
     assert program.train_chunk._cache_size() == 1
 
 
+def test_seeds_vmap_with_cache_and_table_of_episodes():
+    """Through prefill exactly, and one chunk of updates within rounding."""
+    config = point_config(
+        acting_context="episode", window="scattered", return_conditioning="hindsight",
+        chunk_env_steps=40,
+    )  # fmt: skip
+    program = make_program(config, point_env(4))
+    keys = jnp.stack([jax.random.key(seed) for seed in (3, 4)])
+    state = jax.jit(jax.vmap(program.init))(keys)
+    prefilled, _ = jax.jit(jax.vmap(program.prefill))(state)
+    together, _ = jax.jit(jax.vmap(program.train_chunk))(prefilled)
+    for i, seed in enumerate((3, 4)):
+        alone = started(program, seed)
+        for a, b in zip(
+            jax.tree.leaves(prefilled.buffer), jax.tree.leaves(alone.buffer), strict=True
+        ):
+            np.testing.assert_array_equal(a[i], b)
+        alone, _ = program.train_chunk(alone)
+        for part in ("learner", "context", "buffer"):
+            for a, b in zip(
+                jax.tree.leaves(getattr(together, part)),
+                jax.tree.leaves(getattr(alone, part)),
+                strict=True,
+            ):
+                np.testing.assert_allclose(a[i], b, atol=1e-4)
+
+
+class ShortEnv(PointEnv):
+    """Terminates at once: no episode is as long as a window."""
+
+    def step(self, state, action):
+        state, step = super().step(state, action)
+        return state, dataclasses.replace(step, terminated=jnp.ones((), bool))
+
+
+def test_nothing_moves_where_there_is_nothing_to_learn_from():
+    config = point_config(window="scattered", chunk_env_steps=40)
+    program = make_program(config, VectorEnv(ShortEnv(), 4))
+    state = started(program)
+    assert not program.buffer.can_sample(state.buffer)
+    before = jax.tree.map(np.asarray, state.learner)
+    state, metrics = program.train_chunk(state)
+    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(state.learner), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert int(state.counters.updates) == 0
+    assert int(state.counters.env_steps) == 240
+    assert float(metrics["critic_loss"]) == 0.0
+
+
 def test_seeds_vmap_to_the_same_runs(program):
     keys = jnp.stack([jax.random.key(seed) for seed in (3, 4)])
     together, _ = jax.jit(jax.vmap(program.prefill))(jax.jit(jax.vmap(program.init))(keys))

@@ -227,8 +227,9 @@ def window_policies(
         )
     now_key, following_key = jax.random.split(key)
     following = window.following
-    next_return_to_go = _training_return_to_go(parts, following, hyper)
-    if parts.next_rtg_decrement is not None:
+    if parts.next_rtg_decrement is None:
+        next_return_to_go = _training_return_to_go(parts, following, hyper)
+    else:
         next_return_to_go = return_to_go - parts.next_rtg_decrement
     # tokens="gs" with scattered windows: no actions are looked at.
     action = window.action

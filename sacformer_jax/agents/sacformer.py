@@ -32,6 +32,7 @@ def make(config: Config, spec: EnvSpec) -> Agent:
     )
     acting_actor = actor
     if config.context.acting_context == "episode":
-        limit = min(config.context.acting_context_limit, spec.max_episode_steps)
+        steps = spec.max_episode_steps
+        limit = min(config.context.acting_context_limit or steps, steps)
         acting_actor = actor.clone(context_length=limit, cached=True)
     return make_sac_agent(sac_parts(config, spec, actor, acting_actor))
