@@ -9,6 +9,10 @@ from matplotlib.figure import Figure
 
 from sacformer_jax.logging import Record
 
+_LEGEND_INSIDE = 8
+"""Variants that a legend inside a panel has room for."""
+_DASHES = ("-", "--", ":")
+
 
 def learning_curve(records: list[Record], path: Path, title: str) -> None:
     """Draws evaluation and training returns against environment steps into a PNG.
@@ -61,25 +65,40 @@ def comparison(rows: list[Record], path: Path, title: str) -> None:
     """
     envs = list(dict.fromkeys(row["env"] for row in rows))
     variants = list(dict.fromkeys(row["variant"] for row in rows))
-    figure = Figure(figsize=(4 * len(envs), 3.6), layout="constrained")
+    many = len(variants) > _LEGEND_INSIDE
+    figure = Figure(figsize=((6 if many else 4) * len(envs), 6 if many else 3.6))
+    figure.set_layout_engine("constrained")
     FigureCanvasAgg(figure)
     for axes, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
         for place, variant in enumerate(variants):
+            # Ten colours; further variants differ by their dashes.
+            color, dashes = f"C{place % 10}", _DASHES[place // 10 % len(_DASHES)]
             curves: dict[str, dict[int, float]] = {}
             for row in rows:
                 if (row["env"], row["variant"]) == (env, variant):
                     seed = curves.setdefault(str(row["seed"]), {})
                     seed[row["env_steps"]] = row["return_mean"]
             for curve in curves.values():
-                axes.plot(list(curve), list(curve.values()), color=f"C{place}", lw=0.8, alpha=0.5)
+                values = list(curve.values())
+                axes.plot(list(curve), values, dashes, color=color, lw=0.8, alpha=0.3)
             if curves:
                 common = sorted(set.intersection(*(set(curve) for curve in curves.values())))
                 means = [sum(c[step] for c in curves.values()) / len(curves) for step in common]
                 seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
-                axes.plot(common, means, color=f"C{place}", lw=2, label=f"{variant}, {seeds}")
+                axes.plot(common, means, dashes, color=color, lw=2, label=f"{variant}, {seeds}")
         axes.set(xlabel="environment steps", title=env)
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False)
+        if not many:
+            axes.legend(frameon=False)
+    if many:
+        handles = {
+            label: line
+            for axes in figure.axes
+            for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False
+        )
     figure.suptitle(title)
     figure.savefig(path, dpi=110)

@@ -41,7 +41,11 @@ class TransformerConfig:
 
 
 class Dropout(nn.Module):
-    """Inverted dropout from 16 random bits an element, half of what ``nn.Dropout`` draws."""
+    """Inverted dropout from 16 random bits an element.
+
+    ``jax.random`` makes a 32-bit word for each number it draws, however small; here a word serves
+    two elements.
+    """
 
     rate: float
 
@@ -50,7 +54,9 @@ class Dropout(nn.Module):
         if deterministic or self.rate == 0.0:
             return x
         dropped = round(self.rate * 2**16)
-        bits = jax.random.bits(self.make_rng("dropout"), x.shape, jnp.uint16)
+        words = jax.random.bits(self.make_rng("dropout"), (-(-x.size // 2),), jnp.uint32)
+        halves = jax.lax.bitcast_convert_type(words, jnp.uint16)  # [words, 2]
+        bits = halves.reshape(-1)[: x.size].reshape(x.shape)
         return jnp.where(bits >= dropped, x / (1.0 - dropped / 2**16), 0.0)
 
 

@@ -194,6 +194,11 @@ def test_dropout_rate_and_mean():
     assert np.mean(np.asarray(y) == 0.0) == pytest.approx(0.1, abs=0.004)
     assert np.mean(y) == pytest.approx(1.0, abs=0.005)
     np.testing.assert_array_equal(dropout.apply({}, x, True), x)
+    # Neighbours, which share a word of random bits, are dropped independently.
+    dropped = (np.asarray(y) == 0.0).reshape(-1, 2)
+    assert np.mean(dropped.all(axis=1)) == pytest.approx(0.01, abs=0.002)
+    odd = dropout.apply({}, jnp.ones((3, 5)), False, rngs={"dropout": jax.random.key(0)})
+    assert odd.shape == (3, 5)
 
 
 def test_dropout_is_on_only_where_asked_for():
