@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import json
 import statistics
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from bench.clock import Clock
 
 from sacformer_jax import Config, agents
 from sacformer_jax import context as contexts
@@ -33,17 +31,7 @@ NUM_ENVS = (1, 8, 64)
 RESULTS = Path(__file__).parent / "results" / "acting.json"
 
 
-def milliseconds(run: Callable[[], Any], steps: int, repetitions: int = 5) -> float:
-    """Median time of a step."""
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        jax.block_until_ready(run())
-        times.append(1e3 * (time.perf_counter() - start) / steps)
-    return statistics.median(times)
-
-
-def acting(num_envs: int, acting_context: str) -> dict[str, float]:
+def acting(clock: Clock, num_envs: int, acting_context: str) -> dict[str, float]:
     """Cost of a step in the first, middle and last hundred of an episode."""
     config = Config.from_preset("paper", env="HalfCheetah", acting_context=acting_context)
     spec = make_env("HalfCheetah", "native").spec
@@ -61,14 +49,14 @@ def acting(num_envs: int, acting_context: str) -> dict[str, float]:
     context = contexts.start(obs, config.context.context_length, spec.action_size, cache)
     costs = {}
     for first in range(0, EPISODE, STRETCH):
-        after = jax.block_until_ready(stretch(context))  # compiles, the first time
         if first in (0, EPISODE // 2, EPISODE - STRETCH):
-            costs[f"from_step_{first}"] = milliseconds(partial(stretch, context), STRETCH)
-        context = after
+            run = partial(stretch, context)
+            costs[f"from_step_{first}"] = clock.milliseconds(run, STRETCH, repetitions=5)
+        context = stretch(context)
     return costs
 
 
-def computed_anew(num_envs: int) -> float:
+def computed_anew(clock: Clock, num_envs: int) -> float:
     """Cost of one pass over all 1,000 steps, which acting without a cache takes at the end."""
     spec = make_env("HalfCheetah", "native").spec
     actor = TransformerActor(
@@ -86,19 +74,17 @@ def computed_anew(num_envs: int) -> float:
         jnp.ones((num_envs, EPISODE), bool),
     )
     params = jax.jit(actor.init)(jax.random.key(0), *inputs)
-    apply = jax.jit(actor.apply)
-    jax.block_until_ready(apply(params, *inputs))
-    return milliseconds(partial(apply, params, *inputs), 1, repetitions=3)
+    return clock.milliseconds(partial(jax.jit(actor.apply), params, *inputs), repetitions=3)
 
 
 def main() -> None:
     """Measures, prints a Markdown table, writes the JSON."""
-    results = {}
+    clock, results = Clock(), {}
     print("| environments | window of 6 | episode: first 100 | middle | last 100 | anew at 1,000 |")
     print("| --- | --- | --- | --- | --- | --- |")
     for num_envs in NUM_ENVS:
-        window, episode = acting(num_envs, "window"), acting(num_envs, "episode")
-        anew = computed_anew(num_envs) if num_envs <= 8 else None  # 64: 2 GB a layer of attention
+        window, episode = (acting(clock, num_envs, kind) for kind in ("window", "episode"))
+        anew = computed_anew(clock, num_envs) if num_envs <= 8 else None
         results[str(num_envs)] = {"window": window, "episode": episode, "anew": anew}
         cells = [statistics.median(window.values()), *episode.values()]
         shown = [f"{cell:.2f} ms" for cell in cells] + ["–" if anew is None else f"{anew:.0f} ms"]

@@ -127,10 +127,7 @@ class TrajectoryBuffer:
             drawn = episodes.draw(state.episodes, anchor_key, batch_size)
             places = episodes.distinct_sorted(slot_key, drawn.length, self.context_length)
             return self.scattered_window(state, drawn, places, rtg_discount)
-        ends = jnp.cumsum(self.eligible(state))
-        draw = jax.random.randint(anchor_key, (batch_size,), 0, ends[-1])
-        column = jnp.searchsorted(ends, draw, side="right")
-        anchor = draw - jnp.where(column > 0, ends[column - 1], 0)  # age rank, 0 is the oldest
+        column, anchor = episodes.draw_entries(self.eligible(state), anchor_key, batch_size)
         slot = jax.random.randint(slot_key, (batch_size,), 0, self.context_length)
         return self.window(state, column, anchor, slot, rtg_discount)
 

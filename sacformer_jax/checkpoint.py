@@ -180,7 +180,10 @@ class RunFolder:
     def read_config(self) -> RunConfigFile:
         """The run's configuration."""
         contents = self._config_json()
-        return RunConfigFile(Config.from_dict(contents["config"]), contents["sources"])
+        config = Config.from_dict(contents["config"])
+        # A run of an earlier version knows no source of later fields: they are at their defaults.
+        sources = dict.fromkeys(config.flat(), "default")
+        return RunConfigFile(config, {**sources, **contents["sources"]})
 
     def read_spec(self) -> EnvSpec:
         """Facts of the run's environment, without making it."""

@@ -206,8 +206,7 @@ def _describe_run(parsed: DescribeArgs) -> int:
 def _print_config(resolved: Resolved) -> None:
     for name, value in resolved.config.flat().items():
         shown = repr(value) if value in ("", None) else str(value)
-        # A run of an earlier version knows no source of later fields: they are at their defaults.
-        print(f"{name:<24}{shown:<15} {resolved.sources.get(name, 'default')}")
+        print(f"{name:<24}{shown:<15} {resolved.sources[name]}")
 
 
 if __name__ == "__main__":

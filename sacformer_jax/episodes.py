@@ -75,17 +75,25 @@ class Drawn:
 
 def draw(table: EpisodeTable, key: jax.Array, batch_size: int) -> Drawn:
     """Draws B episodes, every one with the same probability."""
-    ends = jnp.cumsum(table.count)
-    number = jax.random.randint(key, (batch_size,), 0, jnp.maximum(ends[-1], 1))
-    column = jnp.minimum(jnp.searchsorted(ends, number, side="right"), ends.size - 1)
-    age_rank = number - (ends - table.count)[column]
+    column, age_rank = draw_entries(table.count, key, batch_size)
     place = (table.first[column] + age_rank) % table.start.shape[1]
     return Drawn(
         column=column,
         start=table.start[column, place],
         length=table.length[column, place],
-        exists=jnp.broadcast_to(ends[-1] > 0, (batch_size,)),
+        exists=jnp.broadcast_to(jnp.any(table.count > 0), (batch_size,)),
     )
+
+
+def draw_entries(counts: jax.Array, key: jax.Array, batch_size: int) -> tuple[jax.Array, jax.Array]:
+    """``(column, age_rank)`` of B entries of columns with ``counts [N]`` of them, all as likely.
+
+    Each is int32 ``[B]``; rank 0 is a column's oldest. Without any entry they mean nothing.
+    """
+    ends = jnp.cumsum(counts)
+    number = jax.random.randint(key, (batch_size,), 0, jnp.maximum(ends[-1], 1))
+    column = jnp.minimum(jnp.searchsorted(ends, number, side="right"), ends.size - 1)
+    return column, number - (ends - counts)[column]
 
 
 def distinct_sorted(key: jax.Array, length: jax.Array, num: int) -> jax.Array:

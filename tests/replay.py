@@ -84,6 +84,21 @@ def transitions(columns: list[list[Step]]) -> Transition:
     )
 
 
+def make_buffer(
+    context_length: int, hindsight: bool, length: int = 25, scattered: bool = False
+) -> TrajectoryBuffer:
+    return TrajectoryBuffer(
+        num_envs=NUM_ENVS,
+        length=length,
+        obs_size=2,
+        action_size=1,
+        context_length=context_length,
+        max_episode_steps=MAX_EPISODE,
+        hindsight=hindsight,
+        scattered=scattered,
+    )
+
+
 def filled(buffer: TrajectoryBuffer, columns: list[list[Step]]) -> BufferState:
     def add(state: BufferState, step: Transition) -> tuple[BufferState, None]:
         return buffer.add(state, step), None

@@ -13,22 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from replay import GAMMA, MAX_EPISODE, NUM_ENVS, Step, filled, oracle_return_to_go, simulate, stored
+from replay import (
+    GAMMA,
+    MAX_EPISODE,
+    Step,
+    filled,
+    make_buffer,
+    oracle_return_to_go,
+    simulate,
+    stored,
+)
 
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.types import Window
-
-
-def make(context_length: int, hindsight: bool, length: int = 25) -> TrajectoryBuffer:
-    return TrajectoryBuffer(
-        num_envs=NUM_ENVS,
-        length=length,
-        obs_size=2,
-        action_size=1,
-        context_length=context_length,
-        max_episode_steps=MAX_EPISODE,
-        hindsight=hindsight,
-    )
 
 
 def eligible(steps: list[Step], hindsight: bool) -> int:
@@ -60,7 +57,7 @@ CASES = list(itertools.product((1, 2, 5), (False, True), (17, 25, 61)))
 
 @pytest.mark.parametrize(("context_length", "hindsight", "num_steps"), CASES)
 def test_every_window_against_the_oracle(context_length, hindsight, num_steps):
-    buffer = make(context_length, hindsight)
+    buffer = make_buffer(context_length, hindsight)
     columns = simulate(num_steps, num_steps)
     ring = stored(columns, buffer.length)
     places, window = every_window(buffer, columns)
@@ -95,7 +92,7 @@ def test_every_window_against_the_oracle(context_length, hindsight, num_steps):
 
 @pytest.mark.parametrize(("context_length", "hindsight", "num_steps"), CASES)
 def test_every_stored_step_has_the_same_expected_weight(context_length, hindsight, num_steps):
-    buffer = make(context_length, hindsight)
+    buffer = make_buffer(context_length, hindsight)
     columns = simulate(num_steps + 100, num_steps)
     places, window = every_window(buffer, columns)
     actor: dict[int, float] = {}
@@ -126,7 +123,7 @@ def test_every_stored_step_has_the_same_expected_weight(context_length, hindsigh
 
 @pytest.mark.parametrize("hindsight", [False, True])
 def test_sample_draws_anchors_and_slots_uniformly(hindsight):
-    buffer = make(2, hindsight)
+    buffer = make_buffer(2, hindsight)
     columns = simulate(3, 61)
     state = filled(buffer, columns)
     num = 40_000
@@ -150,7 +147,7 @@ def test_sample_draws_anchors_and_slots_uniformly(hindsight):
 
 
 def test_can_sample_only_what_is_eligible():
-    plain, hindsight = make(2, False), make(2, True)
+    plain, hindsight = make_buffer(2, False), make_buffer(2, True)
     assert not plain.can_sample(plain.init())
     columns = [steps[:1] for steps in simulate(0, 1)]
     for steps in columns:
@@ -164,7 +161,7 @@ def test_can_sample_only_what_is_eligible():
 
 
 def test_vmapped_buffers_equal_single_ones():
-    buffer = make(5, True)
+    buffer = make_buffer(5, True)
     states = [filled(buffer, simulate(seed, 61)) for seed in (1, 2)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
     keys = jax.random.split(jax.random.key(5), 2)
@@ -189,6 +186,6 @@ def test_memory_is_one_copy_of_each_step():
 
 
 def test_refuses_a_ring_shorter_than_an_episode_and_a_window():
-    make(5, False, length=MAX_EPISODE + 5)
+    make_buffer(5, False, length=MAX_EPISODE + 5)
     with pytest.raises(ValueError, match=r"buffer_capacity=33 over num_envs=3 .*>= 36"):
-        make(5, False, length=MAX_EPISODE + 4)
+        make_buffer(5, False, length=MAX_EPISODE + 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from replay import (
     NUM_ENVS,
     Step,
     filled,
+    make_buffer,
     oracle_return_to_go,
     simulate,
     stored,
@@ -25,18 +27,7 @@ from sacformer_jax import episodes
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.types import BufferState
 
-
-def make(context_length: int, hindsight: bool = True, length: int = 25) -> TrajectoryBuffer:
-    return TrajectoryBuffer(
-        num_envs=NUM_ENVS,
-        length=length,
-        obs_size=2,
-        action_size=1,
-        context_length=context_length,
-        max_episode_steps=MAX_EPISODE,
-        hindsight=hindsight,
-        scattered=True,
-    )
+make = partial(make_buffer, hindsight=True, scattered=True)
 
 
 def finished(steps: list[Step], shortest: int) -> list[list[Step]]:
@@ -90,7 +81,7 @@ def test_the_table_after_every_single_step(shortest):
     ("context_length", "hindsight"), [(1, True), (2, True), (3, True), (3, False)]
 )
 def test_every_window_against_the_oracle(context_length, hindsight):
-    buffer, columns = make(context_length, hindsight), simulate(11, 61)
+    buffer, columns = make(context_length, hindsight=hindsight), simulate(11, 61)
     cases = [
         (column, episode, places)
         for column, steps in enumerate(stored(columns, buffer.length))
