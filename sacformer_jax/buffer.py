@@ -12,6 +12,8 @@ episode, in order; episodes are drawn uniformly, so steps of short ones more oft
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,8 @@ from sacformer_jax import episodes
 from sacformer_jax.config import ConfigError, shortest_column
 from sacformer_jax.context import all_discounted_suffix_sums, discounted_suffix_sums
 from sacformer_jax.types import BufferState, States, Transition, Window
+
+Drawn = TypeVar("Drawn")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,13 +127,23 @@ class TrajectoryBuffer:
           rtg_discount: scalar discount of hindsight return-to-go (unused without hindsight).
         """
         anchor_key, slot_key = jax.random.split(key)
-        if state.episodes is not None:
-            drawn = episodes.draw(state.episodes, anchor_key, batch_size)
-            places = episodes.distinct_sorted(slot_key, drawn.length, self.context_length)
-            return self.scattered_window(state, drawn, places, rtg_discount)
+        table = state.episodes
+        if table is not None:
+            entry = episodes.draw_entries(table.count, anchor_key, batch_size)
+            episode = _in_turns(lambda which: episodes.look_up(table, *which), entry)
+            places = episodes.distinct_sorted(slot_key, episode.length, self.context_length)
+
+            def scattered(which: tuple[episodes.Drawn, jax.Array]) -> Window:
+                return self.scattered_window(state, *which, rtg_discount)
+
+            return _in_turns(scattered, (episode, places))
         column, anchor = episodes.draw_entries(self.eligible(state), anchor_key, batch_size)
         slot = jax.random.randint(slot_key, (batch_size,), 0, self.context_length)
-        return self.window(state, column, anchor, slot, rtg_discount)
+
+        def contiguous(which: tuple[jax.Array, jax.Array, jax.Array]) -> Window:
+            return self.window(state, *which, rtg_discount)
+
+        return _in_turns(contiguous, (column, anchor, slot))
 
     def window(
         self,
@@ -228,3 +242,18 @@ class TrajectoryBuffer:
                 mask=known,
             ),
         )
+
+
+def _in_turns(read: Callable[[Any], Drawn], which: Any) -> Drawn:
+    """``read(which)`` in a loop of two turns (or a few more) over the leading axis of ``which``.
+
+    A loop's body is a computation of its own. Otherwise XLA fuses the writing of the newest step
+    into the reading of the batch, which then needs the ring before and after the step: it copies
+    all of it at every step (jaxlib 0.10.2, CPU).
+    """
+    batch_size = jax.tree.leaves(which)[0].shape[0]
+    turns = next((n for n in range(2, batch_size) if batch_size % n == 0), batch_size)
+    drawn = jax.lax.map(
+        read, jax.tree.map(lambda x: x.reshape(turns, -1, *x.shape[1:]), which)
+    )  # [turns, B / turns, ...]
+    return jax.tree.map(lambda x: x.reshape(batch_size, *x.shape[2:]), drawn)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax.config import CriticConfig
+from sacformer_jax.layers import Dense
 from sacformer_jax.networks import KERNEL_INITS, MLP, embed_steps
 from sacformer_jax.transformer import (
     Transformer,
@@ -120,7 +121,7 @@ class MLPCritic(nn.Module):
         mlp = MLP(
             self.widths, self.activation, self.layer_norm, self.dtype, self.kernel_init, name="mlp"
         )
-        return nn.Dense(1, kernel_init=KERNEL_INITS[self.kernel_init], name="q")(mlp(x))[..., 0]
+        return Dense(1, KERNEL_INITS[self.kernel_init], name="q")(mlp(x))[..., 0]
 
 
 def mlp_critics(
@@ -181,9 +182,9 @@ class TransformerCritic(nn.Module):
         step = {"state": obs, "action": action, "candidate": candidate}
         tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)  # [B, 3T, D]
         mask = candidate_mask(state_mask, self.context_length)
-        features = Transformer(self.config, kept=(2, 3), name="trunk")(tokens, mask)
+        features, _ = Transformer(self.config, kept=(2, 3), name="trunk")(tokens, mask)
         xavier = nn.initializers.xavier_uniform()
-        return nn.Dense(1, kernel_init=xavier, name="q")(features)[..., 0]  # [B, T]
+        return Dense(1, xavier, name="q")(features)[..., 0]  # [B, T]
 
 
 def candidate_mask(state_mask: jax.Array, band: int) -> jax.Array:

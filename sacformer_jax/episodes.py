@@ -43,10 +43,11 @@ def record(
 
     length = step.time_step + 1 - step.bad
     enters = (step.terminated | step.truncated) & (length >= shortest)
-    place = (first + count) % entries
+    # Beyond the table, and so dropped, where none enters.
+    place = jnp.where(enters, (first + count) % entries, entries)
 
     def write(column: jax.Array, value: jax.Array) -> jax.Array:
-        return column.at[rows, place].set(jnp.where(enters, value, column[rows, place]))
+        return column.at[rows, place].set(value, mode="drop")
 
     return EpisodeTable(
         start=write(table.start, (head - step.time_step) % ring_length),
@@ -58,7 +59,7 @@ def record(
 
 @flax.struct.dataclass
 class Drawn:
-    """Episodes drawn uniformly, each ``[B]``.
+    """Episodes drawn, each ``[B]``.
 
     Attributes:
       column: int32, the environment.
@@ -73,15 +74,14 @@ class Drawn:
     exists: jax.Array
 
 
-def draw(table: EpisodeTable, key: jax.Array, batch_size: int) -> Drawn:
-    """Draws B episodes, every one with the same probability."""
-    column, age_rank = draw_entries(table.count, key, batch_size)
+def look_up(table: EpisodeTable, column: jax.Array, age_rank: jax.Array) -> Drawn:
+    """The episodes that are the ``age_rank``-th oldest of their ``column``, each int32 ``[B]``."""
     place = (table.first[column] + age_rank) % table.start.shape[1]
     return Drawn(
         column=column,
         start=table.start[column, place],
         length=table.length[column, place],
-        exists=jnp.broadcast_to(jnp.any(table.count > 0), (batch_size,)),
+        exists=jnp.broadcast_to(jnp.any(table.count > 0), column.shape),
     )
 
 

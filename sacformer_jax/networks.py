@@ -6,15 +6,17 @@ import dataclasses
 from collections.abc import Sequence
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
 from sacformer_jax.cache import cache_places
 from sacformer_jax.config import Tokens
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.layers import Dense, LayerNorm
 from sacformer_jax.transformer import (
     ACTIVATIONS,
-    LAYER_NORM_EPSILON,
+    Seen,
     Transformer,
     TransformerConfig,
     banded_causal_mask,
@@ -43,6 +45,19 @@ class GaussianParams:
 jax.tree_util.register_dataclass(GaussianParams, ["mean", "log_std"], [])
 
 
+@flax.struct.dataclass
+class ActorOutput:
+    """What an actor says of a stretch of states.
+
+    Attributes:
+      gaussian: the action distributions.
+      seen: what the actor's next call may take as its past; empty for one that sees one state.
+    """
+
+    gaussian: GaussianParams
+    seen: Seen
+
+
 class GaussianHeads(nn.Module):
     """Two linear heads; log-std clipped to [-20, 2].
 
@@ -57,8 +72,8 @@ class GaussianHeads(nn.Module):
     @nn.compact
     def __call__(self, features: jax.Array) -> GaussianParams:
         init = nn.initializers.variance_scaling(self.scale**2, "fan_avg", "uniform")
-        mean = nn.Dense(self.action_size, kernel_init=init, name="mean")(features)
-        log_std = nn.Dense(self.action_size, kernel_init=init, name="log_std")(features)
+        mean = Dense(self.action_size, init, name="mean")(features)
+        log_std = Dense(self.action_size, init, name="log_std")(features)
         return GaussianParams(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 
 
@@ -83,11 +98,10 @@ def embed_steps(
     )(jnp.clip(time_step, 0, max_time_step - 1))
     xavier = nn.initializers.xavier_uniform()
     tokens = [
-        nn.Dense(width, kernel_init=xavier, name=f"embed_{name}")(values) + time
-        for name, values in step.items()
+        Dense(width, xavier, name=f"embed_{name}")(values) + time for name, values in step.items()
     ]
     interleaved = jnp.stack(tokens, axis=2).reshape(batch, -1, width)  # [B, nT, D]
-    return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_embed")(interleaved)
+    return LayerNorm(name="ln_embed")(interleaved)
 
 
 class TransformerActor(nn.Module):
@@ -123,18 +137,21 @@ class TransformerActor(nn.Module):
         time_step: jax.Array,
         state_mask: jax.Array,
         deterministic: bool = True,
-    ) -> GaussianParams:
+        past: Seen | None = None,
+    ) -> ActorOutput:
         """Action distributions at every state; with a cache, at the newest one alone.
 
         Args:
           obs: ``[B, T, O]``, normalized.
           action: ``[B, T, A]``, the actions taken; each is seen from the next state on, the last
-            one by nobody, and none at all with ``tokens="gs"``.
+            one by nobody of these, and none at all with ``tokens="gs"``.
           return_to_go: ``[B, T]``, scaled.
           time_step: int32 ``[B, T]``; with a cache, each call must be one step after the one
             before, or 0, where the cache starts anew.
-          state_mask: bool ``[B, T]``, real pairs; with a cache, the time step tells.
+          state_mask: bool ``[B, T]``, real pairs; with a cache, the time step tells. With a past
+            ``[B, P + T]``, its P pairs first.
           deterministic: dropout off; otherwise the rng ``dropout`` is used.
+          past: what an earlier call left, about the P pairs before these.
 
         Returns:
           mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing. With a
@@ -144,10 +161,11 @@ class TransformerActor(nn.Module):
         if self.tokens == "gsa":
             step["action"] = action
         if self.cached:
-            features = self._newest_features(step, time_step, deterministic)
+            features, seen = self._newest_features(step, time_step, deterministic)
         else:
-            features = self._features(step, time_step, state_mask, deterministic)
-        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+            features, seen = self._features(step, time_step, state_mask, deterministic, past)
+        heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
+        return ActorOutput(heads(features), seen)
 
     def _features(
         self,
@@ -155,7 +173,8 @@ class TransformerActor(nn.Module):
         time_step: jax.Array,
         state_mask: jax.Array,
         deterministic: bool,
-    ) -> jax.Array:
+        past: Seen | None,
+    ) -> tuple[jax.Array, Seen]:
         """What the trunk makes of the state tokens, ``[B, T, D]``."""
         n, states = len(step), time_step.shape[1]
         tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)
@@ -163,14 +182,15 @@ class TransformerActor(nn.Module):
         # All tokens of a step share its place in the band; within a step, none sees a later one.
         step_mask = banded_causal_mask(state_mask, self.context_length)
         token_mask = jnp.repeat(jnp.repeat(step_mask, n, axis=1), n, axis=2)  # [B, nT, nT]
-        token_mask &= jnp.tril(jnp.ones((n * states, n * states), bool))
+        token_mask &= jnp.tril(jnp.ones(token_mask.shape[1:], bool))
         # State tokens are the second ones.
         trunk = Transformer(self.config, kept=(1, n), name="trunk")
-        return trunk(tokens, token_mask, deterministic)
+        newest = token_mask[:, -n * states :]  # all of them, but for those of the past
+        return trunk(tokens, newest, deterministic, past=past)
 
     def _newest_features(
         self, step: dict[str, jax.Array], time_step: jax.Array, deterministic: bool
-    ) -> jax.Array:
+    ) -> tuple[jax.Array, Seen]:
         """The same of the newest state token alone, ``[B, 1, D]``, by way of the cache."""
         n = len(step)
         # What is new since the last call: the action taken then (if seen), return and state.
@@ -204,9 +224,9 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         for i, width in enumerate(self.widths):
             init = KERNEL_INITS[self.kernel_init]
-            x = nn.Dense(width, kernel_init=init, dtype=self.dtype, name=f"dense_{i}")(x)
+            x = Dense(width, init, self.dtype, name=f"dense_{i}")(x)
             if self.layer_norm:
-                x = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name=f"ln_{i}")(x)
+                x = LayerNorm(name=f"ln_{i}")(x)
             x = ACTIVATIONS[self.activation](x)
         return x.astype(jnp.float32)
 
@@ -229,7 +249,9 @@ class MLPActor(nn.Module):
         time_step: jax.Array,
         state_mask: jax.Array,
         deterministic: bool = True,
-    ) -> GaussianParams:
-        del action, return_to_go, time_step, state_mask, deterministic
+        past: Seen | None = None,
+    ) -> ActorOutput:
+        del action, return_to_go, time_step, state_mask, deterministic, past
         features = MLP(self.widths, self.activation, dtype=self.dtype, name="mlp")(obs)
-        return GaussianHeads(self.action_size, self.head_init_scale, name="heads")(features)
+        heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
+        return ActorOutput(heads(features), ())

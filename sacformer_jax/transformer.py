@@ -1,6 +1,7 @@
 """A causal pre-LayerNorm GPT-2 trunk. Nothing about reinforcement learning is in it.
 
-Letters: B sequences, T tokens, S query tokens, C tokens in the cache, H heads, D width.
+Letters: B sequences, T tokens, S query tokens, C tokens in the cache, P in the past, H heads, D
+width.
 """
 
 from __future__ import annotations
@@ -8,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend
+
 ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
-LAYER_NORM_EPSILON = 1e-5
 EVERY_TOKEN = (0, 1)
-_MASKED = -1e9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,24 +42,20 @@ class TransformerConfig:
     dtype: str = "float32"
 
 
-class Dropout(nn.Module):
-    """Inverted dropout from 16 random bits an element.
+@flax.struct.dataclass
+class KeysValues:
+    """What later tokens attend to in a block, each ``[B, H, T, D/H]``."""
 
-    ``jax.random`` makes a 32-bit word for each number it draws, however small; here a word serves
-    two elements.
-    """
+    key: jax.Array
+    value: jax.Array
 
-    rate: float
+    def followed_by(self, other: KeysValues) -> KeysValues:
+        """These and, after them, those of later tokens."""
+        return jax.tree.map(lambda *both: jnp.concatenate(both, axis=2), self, other)
 
-    @nn.compact
-    def __call__(self, x: jax.Array, deterministic: bool) -> jax.Array:
-        if deterministic or self.rate == 0.0:
-            return x
-        dropped = round(self.rate * 2**16)
-        words = jax.random.bits(self.make_rng("dropout"), (-(-x.size // 2),), jnp.uint32)
-        halves = jax.lax.bitcast_convert_type(words, jnp.uint16)  # [words, 2]
-        bits = halves.reshape(-1)[: x.size].reshape(x.shape)
-        return jnp.where(bits >= dropped, x / (1.0 - dropped / 2**16), 0.0)
+
+Seen = tuple[KeysValues, ...]
+"""Keys and values of every block."""
 
 
 class Block(nn.Module):
@@ -76,21 +74,19 @@ class Block(nn.Module):
         self,
         x: jax.Array,
         mask: jax.Array,
-        deterministic: bool,
+        dropout: Dropout,
         positions: jax.Array | None = None,
-    ) -> jax.Array:
-        """``x [B, T, D]`` -> ``[B, S, D]``; see :class:`Transformer` for the arguments."""
+        past: KeysValues | None = None,
+    ) -> tuple[jax.Array, KeysValues]:
+        """``x [B, T, D]`` -> ``[B, S, D]`` and its keys and values; see :class:`Transformer`."""
         cfg = self.config
         batch, _, width = x.shape
         head_width = width // cfg.heads
 
-        def project(size: int, name: str) -> nn.Dense:
-            init = nn.initializers.normal(0.02)
-            return nn.Dense(size, kernel_init=init, dtype=cfg.dtype, name=name)
+        def project(size: int, name: str) -> Dense:
+            return Dense(size, nn.initializers.normal(0.02), cfg.dtype, name=name)
 
-        dropout = Dropout(cfg.dropout, name="dropout")
-
-        normed = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_1")(x)
+        normed = LayerNorm(name="ln_1")(x)
         if self.kept != EVERY_TOKEN:
             first, step = self.kept
             kept = slice(first, None, step)
@@ -103,20 +99,21 @@ class Block(nn.Module):
         def split_heads(y: jax.Array) -> jax.Array:
             return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
 
-        q, k, v = split_heads(q), split_heads(k), split_heads(v)
+        seen = KeysValues(split_heads(k), split_heads(v))
         if positions is not None:
-            k = self._cached("key", k, positions, mask.shape[-1])  # [B, H, C, D/H]
-            v = self._cached("value", v, positions, mask.shape[-1])
-        scores = jnp.einsum("bhsd,bhtd->bhst", q, k).astype(jnp.float32) / jnp.sqrt(head_width)
-        weights = jax.nn.softmax(jnp.where(mask[:, None], scores, _MASKED), axis=-1)
-        weights = dropout(weights, deterministic).astype(v.dtype)
-        mixed = jnp.einsum("bhst,bhtd->bhsd", weights, v)
+            seen = KeysValues(
+                self._cached("key", seen.key, positions, mask.shape[-1]),  # [B, H, C, D/H]
+                self._cached("value", seen.value, positions, mask.shape[-1]),
+            )
+        every = seen if past is None else past.followed_by(seen)
+        factors = dropout.factors((batch, cfg.heads, *mask.shape[1:]))
+        mixed = attend(split_heads(q), every.key, every.value, mask, factors)
         mixed = mixed.swapaxes(1, 2).reshape(batch, -1, width)  # [B, S, D]
-        x = x + dropout(project(width, "attention_out")(mixed), deterministic)
+        x = x + dropout(project(width, "attention_out")(mixed))
 
-        hidden = nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_2")(x)
+        hidden = LayerNorm(name="ln_2")(x)
         hidden = ACTIVATIONS[cfg.activation](project(cfg.mlp_ratio * width, "mlp_in")(hidden))
-        return x + dropout(project(width, "mlp_out")(hidden), deterministic)
+        return x + dropout(project(width, "mlp_out")(hidden)), seen
 
     def _cached(self, name: str, new: jax.Array, positions: jax.Array, size: int) -> jax.Array:
         """Writes ``new [B, H, T, D/H]`` into the cache; all of it, ``[B, H, C, D/H]``."""
@@ -146,27 +143,44 @@ class Transformer(nn.Module):
         mask: jax.Array,
         deterministic: bool = True,
         positions: jax.Array | None = None,
-    ) -> jax.Array:
+        past: Seen | None = None,
+    ) -> tuple[jax.Array, Seen]:
         """Runs the trunk, on whole sequences or on the newest tokens of longer ones.
 
         Args:
           x: ``[B, T, D]`` embedded tokens.
           mask: bool ``[B, T, T]``, whether a query (axis 1) may attend to a key (axis 2); every
-            query must have at least one. ``[B, T, C]`` with a cache.
+            query must have at least one. ``[B, T, C]`` with a cache, ``[B, T, P + T]`` with a past.
           deterministic: dropout off.
           positions: int32 ``[B, T]``, where the keys and values of these tokens go in the
             collection ``"cache"``, which must be mutable; queries then attend to the C places of
             the cache instead of to ``x``. None: no cache.
+          past: what the P tokens before these left; they are attended to, too.
 
         Returns:
-          ``[B, S, D]``, the kept tokens.
+          ``[B, S, D]``, the kept tokens, and what a later call may take as its past.
         """
-        x = Dropout(self.config.dropout, name="dropout")(x, deterministic)
-        for i in range(self.config.layers):
-            last = i == self.config.layers - 1
-            block = Block(self.config, self.kept if last else EVERY_TOKEN, name=f"block_{i}")
-            x = block(x, mask, deterministic, positions)
-        return nn.LayerNorm(epsilon=LAYER_NORM_EPSILON, name="ln_f")(x)
+        cfg = self.config
+        dropout = Dropout(None)
+        if not deterministic and cfg.dropout > 0.0:
+            size = self._dropout_size(x.shape[:2], mask.shape[-1])
+            dropout = Dropout(self.make_rng("dropout"), cfg.dropout, size)
+        x = dropout(x)
+        seen = []
+        for i in range(cfg.layers):
+            kept = self.kept if i == cfg.layers - 1 else EVERY_TOKEN
+            before = None if past is None else past[i]
+            x, block_seen = Block(cfg, kept, name=f"block_{i}")(x, mask, dropout, positions, before)
+            seen.append(block_seen)
+        return LayerNorm(name="ln_f")(x), tuple(seen)
+
+    def _dropout_size(self, tokens: tuple[int, ...], keys: int) -> int:
+        """Elements that dropout looks at: the embeddings, and three times in each block."""
+        batch, queries = tokens
+        cfg, (first, step) = self.config, self.kept
+        each = cfg.heads * keys + 2 * cfg.width  # of a query in a block
+        last = len(range(first, queries, step))
+        return batch * (queries * cfg.width + ((cfg.layers - 1) * queries + last) * each)
 
 
 def banded_causal_mask(state_mask: jax.Array, band: int) -> jax.Array:

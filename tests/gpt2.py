@@ -14,6 +14,11 @@ def randomized(params, seed=1, scale=0.4):
     return jax.tree.unflatten(treedef, noisy)
 
 
+def gaussian_of(actor):
+    """``(params, ...) -> GaussianParams`` of an actor without a past."""
+    return lambda *args, **kwargs: actor.apply(*args, **kwargs).gaussian
+
+
 def layer_norm(x, p):
     mean, variance = x.mean(-1, keepdims=True), x.var(-1, keepdims=True)
     return (x - mean) / np.sqrt(variance + 1e-5) * p["scale"] + p["bias"]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gpt2 import randomized
+from gpt2 import gaussian_of, randomized
 from probe import EPISODE, PointEnv, point_config, point_env
 
 from sacformer_jax import agents, rollout
@@ -98,7 +98,7 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
     so_far = np.concatenate([[0.0], np.cumsum(rewards[: steps - 1], dtype=np.float32)])
     count = int(policy.normalizer.count)
     std = np.sqrt(np.asarray(policy.normalizer.m2) / count)
-    gaussian = jax.jit(actor.apply)(
+    gaussian = jax.jit(gaussian_of(actor))(
         policy.actor_params,
         jnp.asarray(np.clip((obs - policy.normalizer.mean) / std, -10, 10))[None],
         jnp.asarray(actions)[None],
@@ -245,7 +245,7 @@ def test_in_training_the_policy_acts_on_the_episode_from_before_it_took_over(pro
     actor = TransformerActor(
         TransformerConfig(2, 16, 1, 4, 0.0, "relu"), 1, EPISODE, EPISODE + 1, 0.01, "gsa"
     )
-    apply, scale = jax.jit(actor.apply), float(policy.return_scale)
+    apply, scale = jax.jit(gaussian_of(actor)), float(policy.return_scale)
     checked = continued = 0
     for env in range(4):
         for now in range(prefilled, prefilled + 15):

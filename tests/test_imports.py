@@ -19,7 +19,8 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("config", "validation", "presets"),
     ("envs",),
     ("types",),
-    ("context", "transformer", "distributions", "normalizer", "cache", "episodes"),
+    ("layers", "distributions"),
+    ("context", "transformer", "normalizer", "cache", "episodes"),
     ("networks",),
     ("critics",),
     ("buffer",),
@@ -47,7 +48,8 @@ PURE = tuple(name for line in ARROW[:NUM_PURE] for name in line)
 NEVER = {
     "agents": {"buffer", "rollout", "train", "evaluate"},
     "evaluate": {"buffer", "rollout", "train"},
-    "transformer": set(RANK),
+    "layers": set(RANK),
+    "transformer": set(RANK) - {"layers"},
     "distributions": set(RANK),
     "envs.tasks": set(RANK),
 }

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gpt2 import dense, gpt2_block, layer_norm, randomized
+from gpt2 import dense, gaussian_of, gpt2_block, layer_norm, randomized
 
 from sacformer_jax.networks import TransformerActor
-from sacformer_jax.transformer import Dropout, TransformerConfig, banded_causal_mask
+from sacformer_jax.transformer import TransformerConfig, banded_causal_mask
 
 OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
 
@@ -73,7 +73,7 @@ def test_actor_equals_the_numpy_decision_transformer(layers, heads, states, toke
     actor = make_actor(layers=layers, heads=heads, tokens=tokens)
     inputs = make_inputs(states)
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
-    out = jax.jit(actor.apply)(params, **inputs)
+    out = jax.jit(gaussian_of(actor))(params, **inputs)
     mean, log_std = oracle(params, inputs, layers, heads, K, tokens)
     real = inputs["state_mask"]
     np.testing.assert_allclose(out.mean[real], mean[real], rtol=1e-5, atol=1e-5)
@@ -89,7 +89,7 @@ def trained(request):
     inputs = make_inputs(K + 2)
     inputs["state_mask"][:] = True
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
-    return jax.jit(actor.apply), params, inputs
+    return jax.jit(gaussian_of(actor)), params, inputs
 
 
 def test_step_t_does_not_depend_on_later_steps(trained):
@@ -127,7 +127,7 @@ def test_bfloat16_is_close_and_keeps_its_parameters_in_float32(tokens):
     actors[1] = actors[1].clone(config=config)
     params = jax.jit(actors[1].init)(jax.random.key(0), **inputs)
     assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
-    exact, rounded = (jax.jit(actor.apply)(params, **inputs) for actor in actors)
+    exact, rounded = (jax.jit(gaussian_of(actor))(params, **inputs) for actor in actors)
     assert rounded.mean.dtype == jnp.float32
     real = inputs["state_mask"]
     difference = np.abs(rounded.mean - exact.mean)[real].max()
@@ -187,28 +187,35 @@ def test_banded_causal_mask_by_hand():
     ]
 
 
-def test_dropout_rate_and_mean():
-    x = jnp.ones((400, 500))
-    dropout = Dropout(0.1)
-    y = dropout.apply({}, x, False, rngs={"dropout": jax.random.key(0)})
-    assert np.mean(np.asarray(y) == 0.0) == pytest.approx(0.1, abs=0.004)
-    assert np.mean(y) == pytest.approx(1.0, abs=0.005)
-    np.testing.assert_array_equal(dropout.apply({}, x, True), x)
-    # Neighbours, which share a word of random bits, are dropped independently.
-    dropped = (np.asarray(y) == 0.0).reshape(-1, 2)
-    assert np.mean(dropped.all(axis=1)) == pytest.approx(0.01, abs=0.002)
-    odd = dropout.apply({}, jnp.ones((3, 5)), False, rngs={"dropout": jax.random.key(0)})
-    assert odd.shape == (3, 5)
-
-
 def test_dropout_is_on_only_where_asked_for():
     actor = make_actor(dropout=0.5)
     inputs = make_inputs()
     params = jax.jit(actor.init)(jax.random.key(0), **inputs)
-    apply = jax.jit(actor.apply, static_argnames="deterministic")
+    apply = jax.jit(gaussian_of(actor), static_argnames="deterministic")
 
     def mean(key):
         return apply(params, **inputs, deterministic=False, rngs={"dropout": key}).mean
 
     assert not np.allclose(mean(jax.random.key(0)), mean(jax.random.key(1)))
     np.testing.assert_array_equal(mean(jax.random.key(0)), mean(jax.random.key(0)))
+
+
+@pytest.mark.parametrize("tokens", ["gs", "gsa"])
+def test_a_state_with_a_past_is_as_in_one_pass(tokens):
+    actor = make_actor(heads=2, tokens=tokens)
+    inputs = make_inputs(K + 1)
+    params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
+    together = jax.jit(gaussian_of(actor))(params, **inputs)
+
+    @jax.jit
+    def apart(params):
+        first = {name: value[:, :K] for name, value in inputs.items()}
+        last = {name: value[:, K:] for name, value in inputs.items()}
+        before = actor.apply(params, **first)
+        last["state_mask"] = inputs["state_mask"]
+        return before.gaussian, actor.apply(params, **last, past=before.seen).gaussian
+
+    before, after = apart(params)
+    for name in ("mean", "log_std"):
+        parts = np.concatenate([getattr(before, name), getattr(after, name)], axis=1)
+        np.testing.assert_allclose(parts, getattr(together, name), rtol=1e-5, atol=1e-5)

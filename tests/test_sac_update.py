@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from gpt2 import gaussian_of
 from probe import point_config, point_env
 
 from sacformer_jax import agents
@@ -75,7 +76,7 @@ def networks(config, spec):
         0.01,
         config.context.tokens,
     )
-    return actor, twin(MLPCritic)((32, 32), "relu", False)
+    return gaussian_of(actor), twin(MLPCritic)((32, 32), "relu", False)
 
 
 # --- by hand ---------------------------------------------------------------------------------
@@ -103,7 +104,7 @@ def test_weighted_mean_and_soft_update():
 
 def shown(config, spec, learner, window):
     """The policy's distributions at the K+1 states, conditioned on the commanded return."""
-    return networks(config, spec)[0].apply(
+    return networks(config, spec)[0](
         learner.actor_params,
         window.obs,
         taken(window),
@@ -248,7 +249,7 @@ def contiguous_policies(config, spec, hyper, window):
     return_to_go = (hyper.target_return - window.return_so_far) / hyper.return_scale
 
     def policy(params, states):
-        return actor.apply(
+        return actor(
             params,
             window.obs[:, :states],
             taken(window)[:, :states],
@@ -397,14 +398,12 @@ def test_scattered_windows_take_two_passes(conditioning):
     @jax.jit
     def reference(learner):
         def now(params):
-            return actor.apply(
+            return actor(
                 params, window.obs, window.action, shown, window.time_step, window.state_mask
             )
 
         def following(params):
-            return actor.apply(
-                params, after.obs, window.action, next_shown, after.time_step, after.mask
-            )
+            return actor(params, after.obs, window.action, next_shown, after.time_step, after.mask)
 
         return reference_update(
             config, spec, learner, hyper, window, key, (now, following), window.obs, after.obs

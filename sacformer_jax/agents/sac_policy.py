@@ -18,7 +18,7 @@ from sacformer_jax.context import commanded_return_to_go
 from sacformer_jax.critics import TwinCritics, make_critics
 from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import GaussianParams, max_time_step
+from sacformer_jax.networks import ActorOutput, GaussianParams, max_time_step
 from sacformer_jax.types import (
     Acted,
     Cache,
@@ -151,7 +151,8 @@ def act(
         rngs={"dropout": jax.random.fold_in(key, _DROPOUT_STREAM)},
         mutable=["cache"],
     )
-    gaussian, changed = output
+    acted, changed = output
+    gaussian = acted.gaussian
     mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
     if explore:
         action = parts.distribution.sample_and_log_prob(key, mean, log_std)[0]
@@ -186,64 +187,64 @@ def window_policies(
 ) -> WindowPolicies:
     """π at the steps of each window and after them, with dropout.
 
+    Only π at the steps is differentiated. Of a contiguous window the K states are looked at in one
+    causal pass; the one state after them goes by itself, with the keys and values of that pass as
+    its past, so that nothing of it is in the backward pass. Scattered windows take two passes.
+
     Args:
       parts: the static parts.
       actor_params: the actor's, in place of those of ``learner``.
       learner: for its normalizer.
       hyper: numeric settings.
-      window: B windows. Contiguous ones take one causal pass over the K+1 states; scattered ones
-        take two.
+      window: B windows.
       key: typed PRNG key of the dropout.
     """
 
-    def gaussian(
-        actor_params: Params,
-        states: Window | States,
-        mask: jax.Array,
-        action: jax.Array,
-        return_to_go: jax.Array,
-        key: jax.Array,
-    ) -> GaussianParams:
+    def look(
+        actor_params: Params, states: States, action: jax.Array, key: jax.Array, **past: Any
+    ) -> ActorOutput:
         output: Any = parts.actor.apply(
             actor_params,
             prepare_obs(parts, learner, states.obs),
             action,
-            return_to_go,
+            states.return_to_go,
             states.time_step,
-            mask,
+            states.mask,
             deterministic=False,
             rngs={"dropout": key},
+            **past,
         )
         return output
 
-    return_to_go = _training_return_to_go(parts, window, hyper)
-    if window.following is None:
-        # The action at the last state is not known, and seen by nobody.
-        action = jnp.pad(window.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
-        both = gaussian(actor_params, window, window.state_mask, action, return_to_go, key)
-        return WindowPolicies(
-            now=jax.tree.map(lambda x: x[:, :-1], both),
-            following=jax.tree.map(lambda x: x[:, 1:], both),
-        )
     now_key, following_key = jax.random.split(key)
-    following = window.following
-    if parts.next_rtg_decrement is None:
-        next_return_to_go = _training_return_to_go(parts, following, hyper)
-    else:
-        next_return_to_go = return_to_go - parts.next_rtg_decrement
-    # tokens="gs" with scattered windows: no actions are looked at.
-    action = window.action
-    return WindowPolicies(
-        now=gaussian(actor_params, window, window.state_mask, action, return_to_go, now_key),
-        following=gaussian(
-            jax.lax.stop_gradient(actor_params),
-            following,
-            following.mask,
-            action,
-            next_return_to_go,
-            following_key,
-        ),
+    frozen = jax.lax.stop_gradient(actor_params)
+    return_to_go = _training_return_to_go(parts, window, hyper)  # [B, K+1], or [B, K] scattered
+    everything = States(
+        window.obs, window.return_so_far, return_to_go, window.time_step, window.state_mask
     )
+    steps = window.action.shape[1]  # K
+    at_steps = jax.tree.map(lambda x: x[:, :steps], everything)
+    now = look(actor_params, at_steps, window.action, now_key)
+    following = window.following
+    if following is None:
+        last = jax.tree.map(lambda x: x[:, steps:], everything)  # [B, 1]
+        # It sees the whole window, whose mask goes with it; its own action is seen by nobody.
+        last = dataclasses.replace(last, mask=window.state_mask)
+        unknown = jnp.zeros_like(window.action[:, :1])
+        seen = jax.lax.stop_gradient(now.seen)
+        after = look(frozen, last, unknown, following_key, past=seen).gaussian
+        next_gaussian = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[:, 1:], b], axis=1), now.gaussian, after
+        )
+    else:
+        if parts.next_rtg_decrement is None:
+            next_return_to_go = _training_return_to_go(parts, following, hyper)
+        else:
+            next_return_to_go = return_to_go - parts.next_rtg_decrement
+        following = dataclasses.replace(following, return_to_go=next_return_to_go)
+        # tokens="gs" with scattered windows: no actions are looked at.
+        next_gaussian = look(frozen, following, window.action, following_key).gaussian
+    return WindowPolicies(now=now.gaussian, following=next_gaussian)
 
 
 def _training_return_to_go(

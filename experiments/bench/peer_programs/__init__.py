@@ -1,0 +1,1 @@
+"""Programs that train with one library each, and their host."""

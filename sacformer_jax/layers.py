@@ -1,0 +1,225 @@
+"""Dense layer, LayerNorm, attention and dropout, with backward passes laid out for speed.
+
+The mathematics, the parameters and their initialization are those of ``flax.linen``'s layers of
+the same names. What differs is how gradients are computed (docs/speed.md): weight gradients as
+one product of two row-major matrices, LayerNorm's and attention's in few passes over memory, and
+the dropout of a whole network from one draw of random bytes.
+
+Letters: N rows, I and O sizes, B sequences, H heads, S queries, T keys, D width.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+EPSILON = 1e-5
+"""Added to the variance in LayerNorm."""
+_MASKED = -1e9
+_BYTE = 256
+
+Initializer = Callable[..., jax.Array]
+Residuals = tuple[Any, ...]
+
+
+def _laid_out(x: jax.Array) -> jax.Array:
+    """``x`` as it is, written to memory on CPUs.
+
+    XLA would otherwise fold a transposition into the product that reads it, and its products of
+    transposed matrices reach half the speed or less on a CPU. Accelerators fold it for free.
+    """
+    return jax.lax.platform_dependent(
+        x, cpu=jax.lax.optimization_barrier, default=lambda folded: folded
+    )
+
+
+# --- dense -----------------------------------------------------------------------------------
+
+
+@jax.custom_vjp
+def affine(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """``x [N, I]``, ``kernel [I, O]``, ``bias [O]`` -> ``x @ kernel + bias``, ``[N, O]``."""
+    return x @ kernel + bias
+
+
+def _affine_forward(
+    x: jax.Array, kernel: jax.Array, bias: jax.Array
+) -> tuple[jax.Array, Residuals]:
+    return affine(x, kernel, bias), (x, kernel)
+
+
+def _affine_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array, ...]:
+    x, kernel = residuals
+    kernel_grad = _laid_out(_laid_out(grad.T) @ x).T  # [I, O]
+    return grad @ kernel.T, kernel_grad, grad.sum(axis=0)
+
+
+affine.defvjp(_affine_forward, _affine_backward)
+
+
+class Dense(nn.Module):
+    """A linear layer with bias, as ``flax.linen.Dense``.
+
+    Attributes:
+      features: O.
+      kernel_init: of the kernel ``[I, O]``; biases start at zero.
+      dtype: of the product and the output; parameters are float32.
+    """
+
+    features: int
+    kernel_init: Initializer
+    dtype: str = "float32"
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """``[..., I]`` -> ``[..., O]``."""
+        size = x.shape[-1]
+        kernel = self.param("kernel", self.kernel_init, (size, self.features))
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        rows = x.reshape(-1, size)  # [N, I]
+        y = affine(*(value.astype(self.dtype) for value in (rows, kernel, bias)))
+        return y.reshape(*x.shape[:-1], self.features)
+
+
+# --- LayerNorm -------------------------------------------------------------------------------
+
+
+@jax.custom_vjp
+def layer_norm(x: jax.Array, scale: jax.Array, bias: jax.Array) -> jax.Array:
+    """LayerNorm (Ba et al., arXiv 1607.06450) of the rows of ``x [N, D]``."""
+    return _layer_norm_forward(x, scale, bias)[0]
+
+
+def _layer_norm_forward(
+    x: jax.Array, scale: jax.Array, bias: jax.Array
+) -> tuple[jax.Array, Residuals]:
+    mean = x.mean(axis=-1, keepdims=True)
+    variance = jnp.maximum((x * x).mean(axis=-1, keepdims=True) - mean * mean, 0.0)
+    inverse_std = jax.lax.rsqrt(variance + EPSILON)
+    return (x - mean) * inverse_std * scale + bias, (x, mean, inverse_std, scale)
+
+
+def _layer_norm_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array, ...]:
+    x, mean, inverse_std, scale = residuals
+    normed = (x - mean) * inverse_std
+    scaled = grad * scale
+    along_mean = scaled.mean(axis=-1, keepdims=True)
+    along_normed = (scaled * normed).mean(axis=-1, keepdims=True)
+    x_grad = inverse_std * (scaled - along_mean - normed * along_normed)
+    return x_grad, (grad * normed).sum(axis=0), grad.sum(axis=0)
+
+
+layer_norm.defvjp(_layer_norm_forward, _layer_norm_backward)
+
+
+class LayerNorm(nn.Module):
+    """LayerNorm over the last axis in float32, as ``flax.linen.LayerNorm``."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """``[..., D]`` -> ``[..., D]`` float32."""
+        width = x.shape[-1]
+        scale = self.param("scale", nn.initializers.ones_init(), (width,))
+        bias = self.param("bias", nn.initializers.zeros_init(), (width,))
+        rows = x.astype(jnp.float32).reshape(-1, width)  # [N, D]
+        return layer_norm(rows, scale, bias).reshape(x.shape)
+
+
+# --- attention -------------------------------------------------------------------------------
+
+
+@jax.custom_vjp
+def attend(
+    query: jax.Array, key: jax.Array, value: jax.Array, mask: jax.Array, keep: jax.Array | None
+) -> jax.Array:
+    """Scaled dot-product attention (Vaswani et al., arXiv 1706.03762); softmax in float32.
+
+    Args:
+      query: ``[B, H, S, D/H]``.
+      key: ``[B, H, T, D/H]``.
+      value: ``[B, H, T, D/H]``.
+      mask: bool ``[B, S, T]``, whether a query may attend to a key.
+      keep: float32 ``[B, H, S, T]``, what dropout multiplies the attention weights by; None: no
+        dropout. Not differentiated.
+
+    Returns:
+      ``[B, H, S, D/H]``.
+    """
+    return _attend_forward(query, key, value, mask, keep)[0]
+
+
+def _attend_forward(
+    query: jax.Array, key: jax.Array, value: jax.Array, mask: jax.Array, keep: jax.Array | None
+) -> tuple[jax.Array, Residuals]:
+    scores = jnp.einsum("bhsd,bhtd->bhst", query, key).astype(jnp.float32)
+    scores = jnp.where(mask[:, None], scores / math.sqrt(query.shape[-1]), _MASKED)
+    weights = jax.nn.softmax(scores, axis=-1)
+    kept = (weights if keep is None else weights * keep).astype(value.dtype)
+    mixed = jnp.einsum("bhst,bhtd->bhsd", kept, value)
+    return mixed, (query, key, value, weights, keep)
+
+
+def _attend_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array | None, ...]:
+    query, key, value, weights, keep = residuals
+    kept = weights if keep is None else weights * keep
+    weights_grad = jnp.einsum("bhsd,bhtd->bhst", grad, value).astype(jnp.float32)
+    if keep is not None:
+        weights_grad = weights_grad * keep
+    # Of the softmax; masked places have weight 0.
+    along_weights = jnp.sum(weights * weights_grad, axis=-1, keepdims=True)
+    scores_grad = weights * (weights_grad - along_weights) / math.sqrt(query.shape[-1])
+    kept, scores_grad = kept.astype(value.dtype), scores_grad.astype(value.dtype)
+    by_key = [_laid_out(y.swapaxes(-1, -2)) for y in (kept, scores_grad)]  # [B, H, T, S]
+    return (
+        jnp.einsum("bhst,bhtd->bhsd", scores_grad, key),
+        jnp.einsum("bhts,bhsd->bhtd", by_key[1], query),
+        jnp.einsum("bhts,bhsd->bhtd", by_key[0], grad),
+        None,
+        None,
+    )
+
+
+attend.defvjp(_attend_forward, _attend_backward)
+
+
+# --- dropout ---------------------------------------------------------------------------------
+
+
+class Dropout:
+    """Inverted dropout of a whole network, from one draw of a random byte an element.
+
+    A draw costs time however small it is, and a 32-bit word is far more than a mask needs. Bytes
+    are handed out in the order of the calls, so the object lives while a network is traced.
+
+    Args:
+      key: typed PRNG key; None: dropout is off.
+      rate: share of elements dropped, taken to the nearest of 1/256, 2/256, …, 255/256.
+      size: how many elements there are to be, over all calls.
+    """
+
+    def __init__(self, key: jax.Array | None, rate: float = 0.0, size: int = 0):
+        self._dropped = min(max(round(rate * _BYTE), 1), _BYTE - 1) if rate > 0.0 else 0
+        self._bytes: jax.Array | None = None
+        self._size, self._used = size, 0
+        if key is not None and self._dropped:
+            words = jax.random.bits(key, (-(-size // 4),), jnp.uint32)
+            self._bytes = jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(-1)
+
+    def factors(self, shape: tuple[int, ...]) -> jax.Array | None:
+        """What to multiply by, float32 of ``shape``: 0, or 1 over the share kept; None: off."""
+        if self._bytes is None:
+            return None
+        start, self._used = self._used, self._used + math.prod(shape)
+        assert self._used <= self._size, "more elements than were drawn"
+        kept = self._bytes[start : self._used].reshape(shape) >= self._dropped
+        return kept * jnp.float32(_BYTE / (_BYTE - self._dropped))
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Drops elements of ``x``."""
+        factors = self.factors(x.shape)
+        return x if factors is None else x * factors
