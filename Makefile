@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RUN ?= runs/halfcheetah
 FLAGS ?=
+JSON ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train resume test test-all lint types check clean
+.PHONY: help install train resume bench test test-all lint types check clean
 
 help:  ## what each target does
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -29,6 +30,9 @@ train: install  ## train SACFormer on HalfCheetah (15 minutes on 2 cores), then 
 resume: install  ## continue `make train` where it stopped
 	$(BIN)/sacformer resume $(RUN)
 	$(BIN)/sacformer evaluate $(RUN) --gymnasium --episodes 10
+
+bench: install  ## how fast it is: a table, with JSON=FILE that file, too, with FLAGS="--part env" one part
+	$(BIN)/python experiments/benchmark.py $(if $(JSON),--json $(JSON)) $(FLAGS)
 
 test: install  ## the quick tests (under 12 minutes on 2 cores)
 	$(BIN)/python -m pytest -n 2 --dist loadscope -m "not slow" $(FLAGS)

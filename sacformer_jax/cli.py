@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from sacformer_jax import checkpoint
+from sacformer_jax import checkpoint, compilation_cache
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.presets import Resolved, resolve
@@ -91,11 +91,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args[0] not in commands:
         return _refused(f"command {args[0]!r} does not exist; there are {', '.join(commands)}")
+    compilation_cache.enable()
     try:
         return commands[args[0]](args[1:])
     except (ConfigError, CheckpointError) as error:
         return _refused(str(error))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+        # Inside a host call XLA makes an error of its own of it, which holds the traceback.
+        if not isinstance(error, KeyboardInterrupt) and "KeyboardInterrupt" not in str(error):
+            raise
         print("stopped at once; what was saved before is intact", file=sys.stderr)
         return EXIT_KILLED
 

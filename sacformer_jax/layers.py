@@ -55,7 +55,10 @@ def _affine_forward(
 
 def _affine_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array, ...]:
     x, kernel = residuals
-    kernel_grad = _laid_out(_laid_out(grad.T) @ x).T  # [I, O]
+    if x.shape[1] <= grad.shape[1]:  # the smaller one is transposed
+        kernel_grad = _laid_out(x.T) @ grad
+    else:
+        kernel_grad = _laid_out(_laid_out(grad.T) @ x).T
     return grad @ kernel.T, kernel_grad, grad.sum(axis=0)
 
 

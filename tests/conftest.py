@@ -7,3 +7,5 @@ os.environ["XLA_FLAGS"] = (
     + " --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 )
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Tests neither read nor fill the user's compilation cache.
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"

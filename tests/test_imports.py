@@ -31,7 +31,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     # Here the outside world begins.
     ("logging",),
     ("checkpoint",),
-    ("plots", "console"),
+    ("plots", "console", "compilation_cache"),
     ("policy",),
     ("gymnasium_eval",),
     ("runner",),
@@ -62,7 +62,7 @@ OUTSIDE = {
 }  # fmt: skip
 ALLOWED = {
     "cores": {"os"},  # which cores there are
-    "envs.native": {"threading", "concurrent"},  # the host's side of the callback
+    "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files
     "envs.mjx_engine": {"threading"},  # MJX's table of collisions is the process's
 }

@@ -6,6 +6,7 @@ import functools
 import subprocess
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import gymnasium
@@ -15,9 +16,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from sacformer_jax.envs import native
+from sacformer_jax.envs import native_host
 from sacformer_jax.envs.mujoco_env import MujocoEnv
 from sacformer_jax.envs.native import NativeEngine
+from sacformer_jax.envs.native_host import STATE_SPEC, Worker
 from sacformer_jax.envs.physics import EngineChoice, ResetNoise
 from sacformer_jax.envs.tasks import TASKS
 
@@ -37,8 +39,8 @@ def make(name: str) -> MujocoEnv:
 
 
 def physics_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    state = np.zeros(mujoco.mj_stateSize(model, native.STATE_SPEC))
-    mujoco.mj_getState(model, data, state, native.STATE_SPEC)
+    state = np.zeros(mujoco.mj_stateSize(model, STATE_SPEC))
+    mujoco.mj_getState(model, data, state, STATE_SPEC)
     return state
 
 
@@ -63,7 +65,7 @@ def edit_state(engine: NativeEngine, words: jax.Array, field: str, value: float)
     """The packed state with the last entry of ``qpos`` or ``qvel`` replaced."""
     physics, measured = engine.unpack_state(np.asarray(words))
     data = mujoco.MjData(engine.model)
-    mujoco.mj_setState(engine.model, data, physics.copy(), native.STATE_SPEC)
+    mujoco.mj_setState(engine.model, data, physics.copy(), STATE_SPEC)
     getattr(data, field)[-1] = value
     return jnp.asarray(engine.pack_state(physics_of(engine.model, data), measured))
 
@@ -283,18 +285,130 @@ def test_a_batch_of_resets_is_one_host_call_and_equals_single_resets(ant):
 
 
 def test_a_batch_is_shared_between_threads(ant, monkeypatch):
-    calls, step = [], native._Worker.step
+    calls, step, both_are_in = [], Worker.step, threading.Barrier(2)
 
-    def recorded(worker, *args):
-        calls.append((threading.get_ident(), id(worker)))
+    def recorded(worker, inputs, outputs, chunk):
+        caller = (threading.get_ident(), id(worker))
+        if caller not in (earlier for earlier, _ in calls):
+            both_are_in.wait(timeout=60)
+        calls.append((caller, list(chunk)))
+        step(worker, inputs, outputs, chunk)
+
+    monkeypatch.setattr(Worker, "step", recorded)
+    jax.block_until_ready(jax.vmap(jax.vmap(ant.engine.step))(ant.states, ant.actions[0]))
+    # Each environment once, by two threads with an MjData each.
+    assert sorted(i for _, chunk in calls for i in chunk) == list(range(6))
+    callers = {caller for caller, _ in calls}
+    assert len({thread for thread, _ in callers}) == len({worker for _, worker in callers}) == 2
+
+
+def test_little_work_and_a_busy_pool_stay_on_the_calling_thread(ant, monkeypatch):
+    step, expected = jax.vmap(ant.engine.step), ant.batched(ant.states, ant.actions)
+    expected = jax.tree.map(lambda x: x[0, 0], expected)
+    pool = ant.engine.threads.pool
+    submitted, submit = [], pool.submit
+    monkeypatch.setattr(
+        pool, "submit", lambda *args: submitted.append(submit(*args)) or submitted[-1]
+    )
+    with monkeypatch.context() as patched:
+        patched.setattr(native_host, "_WORTH_SHARING", 1e9)
+        assert_trees_equal(step(ant.states[0], ant.actions[0, 0]), expected)
+    assert not submitted
+    released = threading.Event()
+    for _ in range(ant.engine.num_threads):
+        submit(released.wait, 60)
+    assert_trees_equal(step(ant.states[0], ant.actions[0, 0]), expected)
+    assert not released.is_set()
+    released.set()
+    assert [helper.cancelled() for helper in submitted] == [True]
+
+
+@pytest.mark.parametrize(
+    ("name", "num_envs", "shared"),
+    [
+        ("HalfCheetah", 4, False),  # 5 frames of 9 degrees of freedom each
+        ("Hopper", 2, False),  # 4 frames of 4 evaluations of 6
+        ("Hopper", 8, True),
+        ("Humanoid", 1, False),
+        ("Humanoid", 2, True),
+    ],
+)
+def test_a_batch_is_shared_where_that_is_worth_it(name, num_envs, shared, monkeypatch):
+    engine = NativeEngine(TASKS[name], num_threads=2)
+    words = jax.vmap(engine.reset)(random_noise(engine, num_envs)).state
+    submitted, submit = [], engine.threads.pool.submit
+    monkeypatch.setattr(
+        engine.threads.pool, "submit", lambda *args: submitted.append(args) or submit(*args)
+    )
+    jax.block_until_ready(jax.vmap(engine.step)(words, random_actions(engine, num_envs)))
+    assert bool(submitted) == shared
+
+
+@pytest.mark.parametrize("broken", [0, 1], ids=["calling", "helping"])
+def test_an_exception_in_a_thread_surfaces_when_none_works_any_more(ant, monkeypatch, broken):
+    workers, step, both_are_in = ant.engine.threads.workers, Worker.step, threading.Barrier(2)
+    entered, started, ended = set(), [], []
+
+    def breaking(worker, *args):
+        if worker not in entered:
+            entered.add(worker)
+            both_are_in.wait(timeout=60)
+        if worker is workers[broken]:
+            raise ValueError("this one breaks")
+        started.append(worker)
+        time.sleep(0.05)  # still at it when the other has ended
+        step(worker, *args)
+        ended.append(worker)
+
+    expected = ant.batched(ant.states, ant.actions[:1])
+    with monkeypatch.context() as patched:
+        patched.setattr(Worker, "step", breaking)
+        with pytest.raises(Exception, match="ValueError: this one breaks"):
+            jax.block_until_ready(ant.batched(ant.states, ant.actions[:1]))
+        assert started == ended == [workers[1 - broken]] * len(started)
+        assert started
+    assert not any(worker.lock.locked() for worker in workers)
+    assert_trees_equal(ant.batched(ant.states, ant.actions[:1]), expected)
+
+
+def test_a_helper_left_by_an_interrupted_call_keeps_its_mjdata(ant, monkeypatch):
+    engine = NativeEngine(TASKS["Ant"], num_threads=3)
+    batched = jax.vmap(jax.vmap(engine.step))
+    expected = jax.tree.map(lambda x: x[0], ant.batched(ant.states, ant.actions))
+    step, left, released = Worker.step, threading.Event(), threading.Event()
+
+    def slow(worker, *args):
+        if worker is not engine.threads.workers[1]:
+            left.wait(60)
+        elif not left.is_set():
+            left.set()
+            released.wait(60)
+        else:
+            assert released.is_set()
         step(worker, *args)
 
-    monkeypatch.setattr(native._Worker, "step", recorded)
-    jax.block_until_ready(jax.vmap(jax.vmap(ant.engine.step))(ant.states, ant.actions[0]))
-    assert len(calls) == 6
-    # Two threads with an MjData each, three environments on each.
-    assert sorted(calls.count(call) for call in set(calls)) == [3, 3]
-    assert len({thread for thread, _ in calls}) == len({worker for _, worker in calls}) == 2
+    def interrupted(helpers):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Worker, "step", slow)
+    with monkeypatch.context() as patched:
+        patched.setattr(native_host, "wait", interrupted)
+        with pytest.raises(BaseException, match="KeyboardInterrupt"):
+            jax.block_until_ready(batched(ant.states, ant.actions[0]))
+    assert engine.threads.workers[1].lock.locked()
+    threading.Timer(0.2, released.set).start()
+    assert_trees_equal(batched(ant.states, ant.actions[0]), expected)
+
+
+def test_no_environments_do_no_harm():
+    engine = make("Ant").engine
+    noise, ctrl = random_noise(engine, 0), random_actions(engine, 0)
+    fresh = jax.vmap(engine.reset)(noise)
+    assert fresh.state.shape == (0, engine.reset(random_noise(engine)).state.size)
+    stepped = jax.vmap(engine.step)(fresh.state, ctrl)
+    both = engine.step_and_reset(fresh.state, ctrl, jnp.zeros(0, bool), noise)
+    for physics in (stepped, *both):
+        assert_trees_equal(physics, fresh)
 
 
 @pytest.mark.parametrize("num_threads", [1, 4, 9])
@@ -315,7 +429,7 @@ def test_two_programs_at_once_get_their_own_results(ant, monkeypatch):
         "batched": (ant.batched, ant.states, ant.actions),
     }
     expected = {key: jax.device_get(f(*args)) for key, (f, *args) in arguments.items()}
-    busy, shared, users, step = set(), [], set(), native._Worker.step
+    busy, shared, users, step = set(), [], set(), Worker.step
 
     def guarded(worker, *args):
         # An MjData in two threads' hands at once is the bug to catch, lucky results or not.
@@ -327,7 +441,7 @@ def test_two_programs_at_once_get_their_own_results(ant, monkeypatch):
         step(worker, *args)
         busy.discard(id(worker))
 
-    monkeypatch.setattr(native._Worker, "step", guarded)
+    monkeypatch.setattr(Worker, "step", guarded)
     results, start_line = {}, threading.Barrier(2)
 
     def run(key):
@@ -389,6 +503,28 @@ def test_every_breakdown_of_the_physics_is_reported_and_stays_alone(tmp_path, mo
         assert_trees_equal(jax.tree.map(lambda x, i=i: x[i], physics), alone)
     # Nothing is remembered: the same worker's next step is not bad.
     assert not engine.step(words, ctrl[0]).bad
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah", "Ant", "Humanoid"])
+def test_a_breakdown_within_a_chunk_is_that_of_one_environment(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo may write a log into the working directory
+    engine = NativeEngine(TASKS[name], num_threads=1)
+    words, bad = jax.vmap(engine.reset)(random_noise(engine, 16)).state, [2, 5, 6]
+    for i in bad:
+        words = words.at[i].set(edit_state(engine, words[i], "qvel", 1e12))
+    ctrl, chunks, step = random_actions(engine, 16), [], Worker.step
+
+    def recorded(worker, inputs, outputs, chunk):
+        chunks.append(len(chunk))
+        step(worker, inputs, outputs, chunk)
+
+    monkeypatch.setattr(Worker, "step", recorded)
+    physics = jax.vmap(engine.step)(words, ctrl)
+    assert chunks[0] == 8  # the bad ones among others
+    assert np.flatnonzero(physics.bad).tolist() == bad
+    for i in set(range(16)) - set(bad):
+        alone = engine.step(words[i], ctrl[i])
+        assert_trees_equal(jax.tree.map(lambda x, i=i: x[i], physics), alone)
 
 
 def test_packing_and_unpacking_a_state():

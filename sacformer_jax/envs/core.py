@@ -217,10 +217,10 @@ class VectorEnv:
 
     def step(self, state: VectorEnvState, action: jax.Array) -> tuple[VectorEnvState, VectorStep]:
         """Steps all environments under ``action [N, A]`` and resets those that finished."""
-        key, reset_key = jax.random.split(state.key)
-        reset_keys = jax.random.split(reset_key, self.num_envs)
+        # One split: on CPU each costs more than the numbers it makes.
+        keys = jax.random.split(state.key, 1 + self.num_envs)
         (env_state, step), prepared = self.env.step_and_refill(
-            state.env, action, state.refill, state.prepared, reset_keys
+            state.env, action, state.refill, state.prepared, keys[1:]
         )
         bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
         time_step = state.time_step + 1
@@ -235,7 +235,7 @@ class VectorEnv:
             time_step=jnp.where(done, 0, time_step),
             prepared=prepared,
             refill=done,
-            key=key,
+            key=keys[0],
         )
         return next_state, VectorStep(
             obs=obs,

@@ -7,17 +7,16 @@ while JAX stays in float32. The measured position is carried because ``xpos`` an
 ``qpos`` by one substep after ``mj_step`` and are not part of MuJoCo's state.
 
 ``jax.vmap`` turns any number of environments (and seeds) into one host call
-(``vmap_method="broadcast_all"``), which a pool of threads works off, one ``MjData`` each;
-``mj_step`` releases the GIL.
+(``vmap_method="broadcast_all"``) with one operand, since each costs time. What happens in it:
+:mod:`sacformer_jax.envs.native_host`.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
-import dataclasses
-import threading
+import itertools
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import jax
@@ -26,111 +25,10 @@ import mujoco
 import numpy as np
 
 from sacformer_jax.cores import usable_cores
+from sacformer_jax.envs.host_call import HostCall
+from sacformer_jax.envs.native_host import STATE_SPEC, Job, Layout, Outputs, Threads, Worker
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, model_path
 from sacformer_jax.envs.tasks import Quantities, Task
-
-STATE_SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS | mujoco.mjtState.mjSTATE_WARMSTART
-# C MuJoCo resets an unstable simulation silently; only these counters tell.
-_BAD_WARNINGS = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_{name}"))
-    for name in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
-]
-# MuJoCo prints a warning, and writes MUJOCO_LOG.TXT into the working directory, only when its
-# counter is 0; counting from here keeps it quiet, and nothing is lost.
-_WARNED_BEFORE = 1000
-_DERIVED_COLUMNS = {"cinert": 10, "cvel": 6, "cfrc_ext": 6}
-
-
-@dataclasses.dataclass(frozen=True)
-class _Layout:
-    """Where each quantity lies in the packed float32 output row of one environment."""
-
-    shapes: dict[str, tuple[int, ...]]
-
-    @property
-    def size(self) -> int:
-        return sum(int(np.prod(shape)) for shape in self.shapes.values())
-
-    def slices(self) -> dict[str, slice]:
-        slices, start = {}, 0
-        for name, shape in self.shapes.items():
-            size = int(np.prod(shape))
-            slices[name] = slice(start, start + size)
-            start += size
-        return slices
-
-    def unpack(self, row: jax.Array) -> dict[str, jax.Array]:
-        return {
-            name: row[where].reshape(self.shapes[name]) for name, where in self.slices().items()
-        }
-
-
-class _Worker:
-    """One thread's ``MjData`` and the loop over its share of the batch."""
-
-    def __init__(self, model: mujoco.MjModel, task: Task, slices: dict[str, slice]):
-        self.model = model
-        self.data = mujoco.MjData(model)
-        self.frame_skip = task.frame_skip
-        self.warnings = self.data.warning.number  # a live view
-        self.body_mass = model.body_mass.copy()
-        self.measure = {
-            "root": self._measure_root,
-            "torso": self._measure_torso,
-            "mass_center": self._measure_mass_center,
-        }[task.measure]
-        # Live views into MjData, written to these places of the output row.
-        self.outputs = [
-            (getattr(self.data, name), where)
-            for name, where in slices.items()
-            if name not in ("displacement", "bad")
-        ]
-        self.displacement = slices["displacement"]
-        self.bad = slices["bad"].start
-        self.num_physics = mujoco.mj_stateSize(model, STATE_SPEC)
-        self.init_qpos = self.data.qpos.copy()
-
-    def _measure_root(self) -> np.ndarray:
-        return np.array([self.data.qpos[0], 0.0])
-
-    def _measure_torso(self) -> np.ndarray:
-        return self.data.xpos[1, :2].copy()
-
-    def _measure_mass_center(self) -> np.ndarray:
-        numerator = np.einsum("b,bj->j", self.body_mass, self.data.xipos)
-        return (numerator / self.body_mass.sum())[:2]
-
-    def _write(self, state_out: np.ndarray, row: np.ndarray) -> None:
-        mujoco.mj_getState(self.model, self.data, state_out[: self.num_physics], STATE_SPEC)
-        for view, where in self.outputs:
-            row[where] = view.reshape(-1)
-
-    def step(self, state: np.ndarray, ctrl: np.ndarray, out: np.ndarray, row: np.ndarray) -> None:
-        """Advances ``state`` (float64) into ``out`` and fills ``row`` (float32)."""
-        model, data = self.model, self.data
-        mujoco.mj_setState(model, data, state[: self.num_physics], STATE_SPEC)
-        data.ctrl[:] = ctrl
-        self.warnings[:] = _WARNED_BEFORE
-        mujoco.mj_step(model, data, nstep=self.frame_skip)
-        mujoco.mj_rnePostConstraint(model, data)
-        self._write(out, row)
-        measured = self.measure()
-        row[self.displacement] = measured - state[self.num_physics :]
-        row[self.bad] = (self.warnings[_BAD_WARNINGS] != _WARNED_BEFORE).any()
-        out[self.num_physics :] = measured
-
-    def reset(
-        self, qpos_noise: np.ndarray, qvel_noise: np.ndarray, out: np.ndarray, row: np.ndarray
-    ) -> None:
-        """Writes a fresh episode's state into ``out`` and its quantities into ``row``."""
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:] = self.init_qpos + qpos_noise
-        self.data.qvel[:] = qvel_noise
-        mujoco.mj_forward(self.model, self.data)
-        self._write(out, row)
-        row[self.displacement] = 0.0
-        row[self.bad] = 0.0
-        out[self.num_physics :] = self.measure()
 
 
 @contextlib.contextmanager
@@ -152,6 +50,19 @@ def load_model(task: Task) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(model_path(task)))
 
 
+def _as_words(values: jax.Array) -> jax.Array:
+    """One part of the host call's operand: a vector or scalar as 32-bit words."""
+    if values.dtype == bool:
+        values = values.astype(jnp.uint32)
+    elif values.dtype != jnp.uint32:
+        values = jax.lax.bitcast_convert_type(values.astype(jnp.float32), jnp.uint32)
+    return values.reshape(-1)
+
+
+_NUMBERS: dict[str, Iterator[int]] = collections.defaultdict(itertools.count)
+"""Engines are numbered by task: in programs that make them in the same order, alike."""
+
+
 class NativeEngine:
     """C MuJoCo behind the engine signature of :mod:`sacformer_jax.envs.physics`.
 
@@ -166,28 +77,36 @@ class NativeEngine:
         self.dt = float(self.model.opt.timestep * task.frame_skip)
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_low, self.action_high = jnp.asarray(low), jnp.asarray(high)
-        shapes: dict[str, tuple[int, ...]] = {"qpos": (self.nq,), "qvel": (self.nv,)}
-        for name in task.derived:
-            columns = _DERIVED_COLUMNS.get(name)
-            shapes[name] = (self.model.nbody, columns) if columns else (self.nv,)
-        self._derived = task.derived
-        self._layout = _Layout({**shapes, "displacement": (2,), "bad": ()})
-        self._num_state = mujoco.mj_stateSize(self.model, STATE_SPEC) + 2
+        self.task = task
         self.num_threads = num_threads or usable_cores()
-        slices = self._layout.slices()
-        self._workers = [_Worker(self.model, task, slices) for _ in range(self.num_threads)]
-        self._pool = ThreadPoolExecutor(self.num_threads, thread_name_prefix="mujoco")
-        self._lock = threading.Lock()  # two programs at once must not share an MjData
-        self.host_calls = 0
+        self.threads = Threads(self.model, task, self.num_threads)
+        self._layout = Layout.of(self.model, task)
+        self._num_physics = mujoco.mj_stateSize(self.model, STATE_SPEC)
+        self._num_words = 2 * (self._num_physics + 2)
+        runge_kutta = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        number = next(_NUMBERS[task.name])
+        self._host_calls = {
+            name: HostCall(f"sacformer_jax.native.{task.name}.{number}.{name}", function)
+            for name, function in {
+                "reset": self._host_reset,
+                "step": self._host_step,
+                "step_and_reset": self._host_step_and_reset,
+            }.items()
+        }
+        self._step_work = task.frame_skip * (4 if runge_kutta else 1) * self.nv
+
+    @property
+    def host_calls(self) -> int:
         """Number of host calls so far (for tests and benchmarks)."""
+        return self.threads.calls
 
     # --- pure functions of one environment ---------------------------------------------------
 
     def reset(self, noise: ResetNoise) -> PhysicsOutput:
-        return self._unpack(*self._call(self._host_reset, 1, noise.qpos, noise.qvel))
+        return self._unpack(*self._call("reset", 1, noise.qpos, noise.qvel))
 
     def step(self, state: jax.Array, ctrl: jax.Array) -> PhysicsOutput:
-        return self._unpack(*self._call(self._host_step, 1, state, ctrl))
+        return self._unpack(*self._call("step", 1, state, ctrl))
 
     def step_and_reset(
         self, states: jax.Array, ctrls: jax.Array, reset: jax.Array, noise: ResetNoise
@@ -198,7 +117,7 @@ class NativeEngine:
         self, state: jax.Array, ctrl: jax.Array, reset: jax.Array, noise: ResetNoise
     ) -> tuple[PhysicsOutput, PhysicsOutput]:
         words, row, fresh_words, fresh_row = self._call(
-            self._host_step_and_reset, 2, state, ctrl, reset, noise.qpos, noise.qvel
+            "step_and_reset", 2, state, ctrl, noise.qpos, noise.qvel, reset
         )
         return self._unpack(words, row), self._unpack(fresh_words, fresh_row)
 
@@ -211,14 +130,13 @@ class NativeEngine:
         state = np.ascontiguousarray(np.asarray(words)).view(np.float64)
         return state[..., :-2], state[..., -2:]
 
-    def _call(self, host_function: Any, outputs: int, *args: jax.Array) -> Any:
+    def _call(self, host_call: str, outputs: int, *parts: jax.Array) -> Any:
         result = (
-            jax.ShapeDtypeStruct((2 * self._num_state,), jnp.uint32),
+            jax.ShapeDtypeStruct((self._num_words,), jnp.uint32),
             jax.ShapeDtypeStruct((self._layout.size,), jnp.float32),
         )
-        return jax.pure_callback(
-            host_function, result * outputs, *args, vmap_method="broadcast_all"
-        )
+        operand = jnp.concatenate([_as_words(part) for part in parts])
+        return self._host_calls[host_call](result * outputs, operand)
 
     def _unpack(self, words: jax.Array, row: jax.Array) -> PhysicsOutput:
         values = self._layout.unpack(row)
@@ -226,65 +144,63 @@ class NativeEngine:
             qpos=values["qpos"],
             qvel=values["qvel"],
             displacement=values["displacement"],
-            derived={name: values[name] for name in self._derived},
+            derived={name: values[name] for name in self.task.derived},
         )
         return PhysicsOutput(state=words, quantities=quantities, bad=values["bad"] > 0.5)
 
-    # --- the host side: NumPy only -----------------------------------------------------------
+    # --- the host call: NumPy only -----------------------------------------------------------
 
-    def _host_step(self, words: Any, ctrl: Any) -> tuple[np.ndarray, ...]:
-        never = np.zeros(np.shape(words)[:-1], bool)
-        return self._host_step_and_reset(words, ctrl, never, None, None)[:2]
+    def _host_step(self, operand: Any) -> tuple[np.ndarray, ...]:
+        operand = np.asarray(operand)
+        return self._host(operand, np.zeros(operand.shape[:-1], bool))[:2]
 
-    def _host_reset(self, qpos_noise: Any, qvel_noise: Any) -> tuple[np.ndarray, ...]:
-        always = np.ones(np.shape(qpos_noise)[:-1], bool)
-        return self._host_step_and_reset(None, None, always, qpos_noise, qvel_noise)[2:]
+    def _host_reset(self, operand: Any) -> tuple[np.ndarray, ...]:
+        operand = np.asarray(operand)
+        return self._host(operand, np.ones(operand.shape[:-1], bool), steps=False)[2:]
 
-    def _host_step_and_reset(
-        self, words: Any, ctrl: Any, reset: Any, qpos_noise: Any, qvel_noise: Any
+    def _host_step_and_reset(self, operand: Any) -> tuple[np.ndarray, ...]:
+        operand = np.asarray(operand)
+        return self._host(operand, operand[..., -1] != 0)
+
+    def _host(
+        self, operand: np.ndarray, resets: np.ndarray, steps: bool = True
     ) -> tuple[np.ndarray, ...]:
-        """All environments, any leading shape; ``words is None`` steps none."""
-        reset_mask = np.asarray(reset)
-        batch_shape, resets = reset_mask.shape, reset_mask.reshape(-1)
-        num = resets.size
-        state = ctrls = qpos = qvel = None
-        if words is not None:
-            state = np.ascontiguousarray(np.asarray(words)).reshape(num, -1).view(np.float64)
-            ctrls = np.asarray(ctrl).reshape(num, -1)
-        if qpos_noise is not None:
-            qpos = np.asarray(qpos_noise).reshape(num, -1)
-            qvel = np.asarray(qvel_noise).reshape(num, -1)
-        out, fresh = np.zeros((2, num, self._num_state))
-        row, fresh_row = np.zeros((2, num, self._layout.size), np.float32)
+        """All environments, of any leading shape.
 
-        def work(worker: _Worker, start: int, stop: int) -> None:
-            for i in range(start, stop):
-                if state is not None and ctrls is not None:
-                    worker.step(state[i], ctrls[i], out[i], row[i])
-                if resets[i] and qpos is not None and qvel is not None:
-                    worker.reset(qpos[i], qvel[i], fresh[i], fresh_row[i])
+        Args:
+          operand: ``[..., words]`` uint32: state and control if ``steps``, then the noise of qpos
+            and qvel if there are ``resets``; what follows is not looked at.
+          resets: ``[...]`` bool, which environments get a fresh episode.
+          steps: whether to step all.
 
-        self._run(work, num)
-
-        def words_of(states: np.ndarray) -> np.ndarray:
-            return states.view(np.uint32).reshape(*batch_shape, 2 * self._num_state)
-
-        rows = [r.reshape(*batch_shape, self._layout.size) for r in (row, fresh_row)]
-        return words_of(out), rows[0], words_of(fresh), rows[1]
-
-    def _run(self, work: Any, num: int) -> None:
-        """Splits ``num`` environments over the threads; a single one stays on this thread."""
-        shares = min(self.num_threads, num)
-        bounds = np.linspace(0, num, shares + 1).astype(int)
-        with self._lock:
-            pending = [
-                self._pool.submit(work, self._workers[k], bounds[k], bounds[k + 1])
-                for k in range(1, shares)
-            ]
-            self.host_calls += 1
-            try:
-                work(self._workers[0], bounds[0], bounds[1])
-            finally:  # whatever happened here, their MjData are theirs until they are done
-                wait(pending)
-            for future in pending:
-                future.result()
+        Returns:
+          States ``[..., words of a state]`` uint32 and rows ``[..., layout.size]`` float32 after
+          the step, and both of the fresh episodes; zeros where nothing was asked for.
+        """
+        num, nq, nu, num_physics = resets.size, self.nq, self.model.nu, self._num_physics
+        words, chosen = operand.reshape(num, operand.shape[-1]), np.flatnonzero(resets).tolist()
+        stepped, fresh = (Outputs(num, num_physics, self._layout) for _ in range(2))
+        jobs: list[Job] = []
+        if steps:
+            state = words[:, : self._num_words].view(np.float64)
+            words = words[:, self._num_words :]
+            inputs = np.empty((num, num_physics + nu))
+            inputs[:, :num_physics] = state[:, :num_physics]
+            inputs[:, num_physics:] = words[:, :nu].view(np.float32)
+            words = words[:, nu:]
+            stepped.prepare(self.task, self.model, self._layout)
+            jobs.append(Job(Worker.step, inputs, stepped, range(num), self._step_work))
+        if chosen:
+            noise = words[:, : nq + self.nv].view(np.float32)
+            fresh.prepare(self.task, self.model, self._layout)
+            jobs.append(Job(Worker.reset, noise, fresh, chosen, self.nv))
+        self.threads.run(jobs)
+        if steps:
+            stepped.finish(self.model, state[:, num_physics:])
+        if chosen:
+            fresh.finish(self.model, None)
+        return tuple(
+            values.reshape(*resets.shape, values.shape[-1])
+            for outputs in (stepped, fresh)
+            for values in (outputs.states.view(np.uint32), outputs.rows)
+        )

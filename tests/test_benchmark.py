@@ -1,0 +1,90 @@
+"""The benchmark's frame, with tiny parts, and the arithmetic of its memory."""
+
+import json
+
+import benchmark
+import jax
+import jax.numpy as jnp
+import pytest
+from bench import scaling
+
+from sacformer_jax.buffer import TrajectoryBuffer
+
+
+def small(clock):
+    return {"small.case.ms": 0.12345, "small.case.steps_per_s": 23456.7, "small.version": "1.2"}
+
+
+def failing(clock):
+    raise ValueError("no such | thing")
+
+
+def test_table_is_grouped_by_part(capsys):
+    assert benchmark.main([], {"small": small}) == 0
+    printed = capsys.readouterr().out
+    heading = printed.index("## small")
+    for line in ("| case.ms | 0.123 |", "| case.steps_per_s | 23,457 |", "| version | 1.2 |"):
+        assert printed.index(line) > heading
+    assert "## machine" in printed
+    assert "| gemm_ms | " in printed
+
+
+def test_a_failing_part_is_told_and_the_others_go_on(tmp_path, capsys):
+    path = tmp_path / "new" / "results.json"
+    parts = {"broken": failing, "small": small}
+    assert benchmark.main(["--json", str(path)], parts) == 1
+    results = json.loads(path.read_text())
+    assert results["broken.error"] == "ValueError: no such | thing"
+    assert results["small.case.ms"] == 0.12345
+    assert r"| error | ValueError: no such \| thing |" in capsys.readouterr().out
+
+
+def test_json_is_written_after_each_part(tmp_path):
+    path = tmp_path / "results.json"
+
+    def interrupted(clock):
+        assert json.loads(path.read_text())["small.case.ms"] == 0.12345
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.main(["--json", str(path)], {"small": small, "last": interrupted})
+    results = json.loads(path.read_text())
+    assert results["small.version"] == "1.2"
+    assert results["gemm_ms"] > 0
+    assert results["seconds.small"] >= 0
+    assert results["machine.cores"] >= 1
+    assert {"machine.env.XLA_FLAGS", "machine.load_average_at_start"} <= set(results)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_only_the_parts_asked_for_are_measured(tmp_path):
+    path = tmp_path / "results.json"
+    parts = {"broken": failing, "small": small}
+    assert benchmark.main(["--part", "small", "--json", str(path)], parts) == 0
+    assert not any(key.startswith("broken") for key in json.loads(path.read_text()))
+
+
+def test_an_unknown_part_is_refused(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        benchmark.main(["--part", "nothing"])
+    assert "nothing" in capsys.readouterr().err
+
+
+def test_bytes_are_counted_from_shapes():
+    tree = {"a": jnp.zeros((3, 5)), "b": jax.ShapeDtypeStruct((7,), bool)}
+    assert scaling.num_bytes(tree) == 3 * 5 * 4 + 7
+    assert scaling.transition_bytes(obs_size=17, action_size=6) == 4 * (17 + 6 + 1) + 1 + 1
+
+
+def test_bytes_of_a_small_replay():
+    state = jax.eval_shape(TrajectoryBuffer(2, 50, 3, 1, 4, 20).init)
+    # Beside a transition: time step, return so far, bad physics; once: head, size, two running.
+    beside, once = 4 + 4 + 1, 4 + 4 + 2 * 4
+    expected = 2 * 50 * (scaling.transition_bytes(3, 1) + beside) + once
+    assert scaling.num_bytes(state) == expected
+
+
+def test_peak_memory_grows_with_what_is_held():
+    before = scaling.peak_resident_bytes()
+    held = bytearray(b"x") * (before + 50_000_000)
+    assert scaling.peak_resident_bytes() >= before + len(held) // 2
