@@ -32,10 +32,11 @@ def enable() -> Path | None:
     ``JAX_ENABLE_COMPILATION_CACHE=false`` for none. A folder that cannot be written is no reason to
     stop: then there is no cache.
     """
-    if not jax.config.jax_enable_compilation_cache:
+    settings = jax.config.values
+    if not settings["jax_enable_compilation_cache"]:
         return None
-    if jax.config.jax_compilation_cache_dir is not None:
-        return Path(jax.config.jax_compilation_cache_dir)
+    if settings["jax_compilation_cache_dir"] is not None:
+        return Path(settings["jax_compilation_cache_dir"])
     path = folder()
     try:
         path.mkdir(parents=True, exist_ok=True)

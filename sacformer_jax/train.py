@@ -7,6 +7,7 @@ One iteration collects a few steps of all environments and then makes the gradie
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -21,6 +22,7 @@ from sacformer_jax.envs import VectorEnv, make_env
 from sacformer_jax.rollout import RolloutState, RolloutStats
 from sacformer_jax.types import (
     Acted,
+    BufferState,
     Context,
     Counters,
     Hyperparameters,
@@ -30,6 +32,9 @@ from sacformer_jax.types import (
 )
 
 Metrics = dict[str, jax.Array]
+UpdateFromReplay = Callable[
+    [BufferState, Hyperparameters, LearnerState, jax.Array], tuple[LearnerState, Metrics]
+]
 
 _LOOKING_STREAM = 2**31
 """Folded into a key of prefill, apart from the random action."""
@@ -47,6 +52,8 @@ class Program:
       init: ``key -> TrainState``.
       prefill: ``TrainState -> (TrainState, metrics)``, random actions; the argument is donated.
       train_chunk: ``TrainState -> (TrainState, metrics)``, one chunk; the argument is donated.
+      update: ``(buffer state, hyper, learner, key) -> (learner, metrics)``, one gradient update on
+        a batch from the replay; part of ``train_chunk``, not jitted by itself.
     """
 
     config: Config
@@ -56,6 +63,7 @@ class Program:
     init: jax.stages.Wrapped
     prefill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
+    update: UpdateFromReplay
 
 
 def make_training_env(config: Config, num_envs: int | None = None) -> VectorEnv:
@@ -98,6 +106,7 @@ def make_program(config: Config, env: VectorEnv | None = None) -> Program:
         init=jax.jit(functions.init),
         prefill=jax.jit(functions.prefill, donate_argnums=0),
         train_chunk=jax.jit(functions.train_chunk, donate_argnums=0),
+        update=functions.update,
     )
 
 
@@ -190,16 +199,11 @@ class _TrainingFunctions:
 
         state, stats = self._collect(state, choose_action, num_steps)
 
-        def one_update(learner: LearnerState, key: jax.Array) -> tuple[LearnerState, Metrics]:
-            sample_key, update_key = jax.random.split(key)
-            window = self.buffer.sample(
-                state.buffer, sample_key, self.config.replay.batch_size, state.hyper.rtg_discount
-            )
-            return self.agent.update(learner, state.hyper, window, update_key)
-
         key, updates_key = jax.random.split(state.key)
         learner, metrics = jax.lax.scan(
-            one_update, state.learner, jax.random.split(updates_key, num_updates)
+            partial(self.update, state.buffer, state.hyper),
+            state.learner,
+            jax.random.split(updates_key, num_updates),
         )
         if self.buffer.scattered:
             # Episodes shorter than K may leave nothing to learn from; momentum must not move on.
@@ -213,6 +217,14 @@ class _TrainingFunctions:
             stats,
             metrics,
         )
+
+    def update(
+        self, buffer: BufferState, hyper: Hyperparameters, learner: LearnerState, key: jax.Array
+    ) -> tuple[LearnerState, Metrics]:
+        sample_key, update_key = jax.random.split(key)
+        batch_size = self.config.replay.batch_size
+        window = self.buffer.sample(buffer, sample_key, batch_size, hyper.rtg_discount)
+        return self.agent.update(learner, hyper, window, update_key)
 
     def _collect(
         self, state: TrainState, choose_action: rollout.ChooseAction, num_steps: int

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -41,12 +41,20 @@ class Clock:
 
     def milliseconds(self, run: Callable[[], Any], per: int = 1, repetitions: int = 7) -> float:
         """Median time of ``run`` over ``per`` things it does, after one run that is not counted."""
-        jax.block_until_ready(run())
-        times = []
+        return self.side_by_side({"run": run}, per, repetitions)["run"]
+
+    def side_by_side(
+        self, runs: Mapping[str, Callable[[], Any]], per: int = 1, repetitions: int = 7
+    ) -> dict[str, float]:
+        """The same for several, taking turns, so that what slows the machine down slows all."""
+        for run in runs.values():
+            jax.block_until_ready(run())
+        times: dict[str, list[float]] = {name: [] for name in runs}
         for _ in range(repetitions):
             self._time_products()
-            start = time.perf_counter()
-            jax.block_until_ready(run())
-            times.append(1e3 * (time.perf_counter() - start) / per)
+            for name, run in runs.items():
+                start = time.perf_counter()
+                jax.block_until_ready(run())
+                times[name].append(1e3 * (time.perf_counter() - start) / per)
         self._time_products()
-        return statistics.median(times)
+        return {name: statistics.median(of_one) for name, of_one in times.items()}

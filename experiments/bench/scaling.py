@@ -10,7 +10,6 @@ import dataclasses
 import json
 import os
 import resource
-import statistics
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -60,15 +59,7 @@ def updates(config: Config) -> Run:
         hyper=hyperparameters(config, program.env.spec.action_size),
         buffer=program.buffer.init(),
     )
-    run = updater(program, dataclasses.replace(state, buffer=full_buffer(program, state)))
-    learner = state.learner
-
-    def again() -> Any:
-        nonlocal learner
-        learner = run(learner)
-        return learner
-
-    return again
+    return updater(program, dataclasses.replace(state, buffer=full_buffer(program, state)))
 
 
 def iterations(num_envs: int, num_seeds: int = 1) -> Run:
@@ -102,13 +93,8 @@ def in_turns(clock: Clock, runs: Mapping[str, Run], per: int) -> dict[str, float
 
     They take turns, so that the noise of a shared machine hits all sizes alike.
     """
-    turns = [
-        {name: clock.milliseconds(run, per, repetitions=1) for name, run in runs.items()}
-        for _ in range(REPETITIONS)
-    ]
     results: dict[str, float] = {}
-    for name in runs:
-        milliseconds = statistics.median(turn[name] for turn in turns)
+    for name, milliseconds in clock.side_by_side(runs, per, REPETITIONS).items():
         results[f"{name}.ms"] = milliseconds
         results[f"{name}.gemm_units"] = milliseconds / clock.gemm_ms
     return results
