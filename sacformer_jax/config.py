@@ -125,7 +125,7 @@ class ActorConfig:
     actor_mlp_ratio: int = 4
     """Hidden width of a block's MLP over actor_width (sacformer)."""
     actor_dropout: float = 0.1
-    """Dropout rate in updates (sacformer)."""
+    """Dropout rate in updates (sacformer), taken to the nearest of 1/256, 2/256, …"""
     acting_dropout: bool = False
     """Leave dropout on in acting and in evaluation (sacformer)."""
     actor_activation: Activation = "relu"

@@ -19,9 +19,12 @@ class ActionDistribution(Protocol):
         ...
 
     def sample_and_log_prob(
-        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+        self, noise: jax.Array, mean: jax.Array, log_std: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """A reparameterized action ``[..., A]`` and its log density ``[...]``."""
+        """A reparameterized action ``[..., A]`` and its log density ``[...]``.
+
+        ``noise [..., A]`` is standard normal.
+        """
         ...
 
 
@@ -55,7 +58,7 @@ class TanhGaussian(_Box):
     """``action = center + half_range * tanh(u)``, ``u ~ N(mean, exp(log_std)^2)``."""
 
     def sample_and_log_prob(
-        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+        self, noise: jax.Array, mean: jax.Array, log_std: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """A reparameterized action and its log density.
 
@@ -63,14 +66,13 @@ class TanhGaussian(_Box):
         ``log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u))``.
 
         Args:
-          key: typed PRNG key.
+          noise: ``[..., A]`` standard normal.
           mean: ``[..., A]``.
           log_std: ``[..., A]``.
 
         Returns:
           ``(action [..., A], log_prob [...])``.
         """
-        noise = jax.random.normal(key, mean.shape)
         u = mean + jnp.exp(log_std) * noise
         gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
         squash = 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)) + np.log(self._half_range)
@@ -93,12 +95,14 @@ class NoisyPoint(_Box):
     noise_clip: float
 
     def sample_and_log_prob(
-        self, key: jax.Array, mean: jax.Array, log_std: jax.Array
+        self, noise: jax.Array, mean: jax.Array, log_std: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The noisy action ``[..., A]`` and zeros ``[...]``; ``log_std`` is not looked at."""
+        """The noisy action ``[..., A]`` and zeros ``[...]``; ``log_std`` is not looked at.
+
+        ``noise [..., A]`` is standard normal.
+        """
         del log_std
-        noise = self.noise * jax.random.normal(key, mean.shape)
-        noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
+        noise = jnp.clip(self.noise * noise, -self.noise_clip, self.noise_clip)
         action = self.mode(mean) + self._half_range * noise
         bounded = jnp.clip(action, jnp.asarray(self.low), jnp.asarray(self.high))
         return bounded, jnp.zeros(mean.shape[:-1])

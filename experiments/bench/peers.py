@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 VENVS = ROOT / ".venv-peers"
 ENVIRONMENT = {"PYTHONPATH": str(ROOT / "experiments"), "JAX_PLATFORMS": "cpu"}
 ENV = "HalfCheetah"
-ROUNDS = 5
+ROUNDS = 9
 STRETCH_STEPS = 500
 LIMIT_SECONDS = 240.0
 
@@ -184,12 +184,15 @@ def _speed(stretches: list[Answer]) -> dict[str, float]:
 
 def _comparison(stretches: dict[str, list[Answer]], prefix: str) -> dict[str, float | str]:
     """Ours over the fastest peer, if there is one to compare with."""
-    medians = {name: statistics.median(_rates(answers)) for name, answers in stretches.items()}
-    ours = medians.pop("ours", None)
-    if ours is None or not medians:
+    rates = {name: _rates(answers) for name, answers in stretches.items()}
+    ours = rates.pop("ours", None)
+    if ours is None or not rates:
         return {}
+    medians = {name: statistics.median(of_one) for name, of_one in rates.items()}
     fastest = max(medians, key=lambda name: medians[name])
+    # Round by round: what slows the machine down for a while slows both.
+    by_round = [mine / theirs for mine, theirs in zip(ours, rates[fastest], strict=True)]
     return {
         f"{prefix}.fastest_peer": fastest,
-        f"{prefix}.ours_over_fastest": ours / medians[fastest],
+        f"{prefix}.ours_over_fastest": statistics.median(by_round),
     }

@@ -155,7 +155,8 @@ def act(
     gaussian = acted.gaussian
     mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
     if explore:
-        action = parts.distribution.sample_and_log_prob(key, mean, log_std)[0]
+        noise = jax.random.normal(key, mean.shape)
+        action = parts.distribution.sample_and_log_prob(noise, mean, log_std)[0]
     else:
         action = parts.distribution.mode(mean)
     return Acted(action, dataclasses.replace(context, cache=changed.get("cache", {})))

@@ -102,19 +102,21 @@ def _init(parts: SACParts, key: jax.Array) -> LearnerState:
 def _update(
     parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
 ) -> tuple[LearnerState, Metrics]:
-    dropout_key, next_key, action_key = jax.random.split(key, 3)
+    keys = jax.random.split(key, 3)
+    # Both in one draw: a draw costs time however small it is.
+    next_noise, noise = jax.vmap(lambda key: jax.random.normal(key, window.action.shape))(keys[1:])
 
     def policies(actor_params: Params) -> tuple[GaussianParams, GaussianParams]:
-        both = window_policies(parts, actor_params, learner, hyper, window, dropout_key)
+        both = window_policies(parts, actor_params, learner, hyper, window, keys[0])
         return both.now, both.following
 
     gaussian, pull_back, next_gaussian = jax.vjp(policies, learner.actor_params, has_aux=True)
     inputs = _critic_inputs(parts, learner, window)
     learner, critic_metrics = _update_critics(
-        parts, learner, hyper, window, inputs, next_gaussian, next_key
+        parts, learner, hyper, window, inputs, next_gaussian, next_noise
     )
     learner, actor_metrics = _update_actor(
-        parts, learner, hyper, window, inputs, gaussian, pull_back, action_key
+        parts, learner, hyper, window, inputs, gaussian, pull_back, noise
     )
     # Temperature: J(α) = E[-α (log π + target entropy)].
     alpha = jnp.exp(learner.log_alpha)
@@ -143,11 +145,11 @@ def _update_critics(
     window: Window,
     inputs: CriticInputs,
     next_gaussian: GaussianParams,
-    key: jax.Array,
+    noise: jax.Array,
 ) -> tuple[LearnerState, Metrics]:
     """Eq. 6-8, and the soft update of the targets. Nothing is differentiated through the actor."""
     next_action, next_log_prob = parts.distribution.sample_and_log_prob(
-        key, next_gaussian.mean, next_gaussian.log_std
+        noise, next_gaussian.mean, next_gaussian.log_std
     )
     y = bellman_target(
         window.reward,
@@ -187,7 +189,7 @@ def _update_actor(
     inputs: CriticInputs,
     gaussian: GaussianParams,
     pull_back: Callable[[GaussianParams], tuple[Params]],
-    key: jax.Array,
+    noise: jax.Array,
 ) -> tuple[LearnerState, Metrics]:
     """Eq. 10-13, through the distributions whose gradient ``pull_back`` takes to the parameters."""
     alpha = jnp.exp(learner.log_alpha)
@@ -195,7 +197,7 @@ def _update_actor(
 
     def loss(gaussian: GaussianParams) -> tuple[jax.Array, jax.Array]:
         action, log_prob = parts.distribution.sample_and_log_prob(
-            key, gaussian.mean, gaussian.log_std
+            noise, gaussian.mean, gaussian.log_std
         )
         min_q = jnp.min(parts.critics.now(learner.critic_params, inputs, action), axis=0)
         return weighted_mean(alpha * log_prob - min_q, weight), log_prob
