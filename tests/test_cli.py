@@ -12,9 +12,10 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import pytest
 
-from sacformer_jax import Config
+from sacformer_jax import Config, cli
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, main
 from sacformer_jax.config import field_places
@@ -512,3 +513,20 @@ def test_evaluate_in_gymnasium_beside_random_actions(run, runs: Runs) -> None:
 def test_a_refusal_in_a_process(tmp_path: Path) -> None:
     said = Command(tmp_path, "resume", tmp_path / "missing").wait()
     _assert_refused(said, tmp_path / "missing")
+
+
+def test_an_interrupted_host_call_ends_like_any_interrupt(monkeypatch, capsys):
+    """XLA turns the KeyboardInterrupt into an error of its own; other errors stay errors."""
+
+    def fails(message: str) -> None:
+        def describe(args: list[str]) -> int:
+            raise jax.errors.JaxRuntimeError(message)
+
+        monkeypatch.setattr(cli, "_describe", describe)
+
+    fails("INTERNAL: the host function failed:\nTraceback …\nKeyboardInterrupt\n")
+    assert main(["describe"]) == cli.EXIT_KILLED
+    assert "stopped at once" in capsys.readouterr().err
+    fails("RESOURCE_EXHAUSTED: out of memory")
+    with pytest.raises(jax.errors.JaxRuntimeError, match="out of memory"):
+        main(["describe"])
