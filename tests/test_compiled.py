@@ -6,16 +6,13 @@ import re
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import pytest
 from probe import EPISODE, point_config, point_env
 
-from sacformer_jax import agents
 from sacformer_jax.checkpoint import num_bytes
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.train import hyperparameters, make_program
-from sacformer_jax.types import Window
+from sacformer_jax.train import make_program
 
 RING = 997  # a length that no other array has
 
@@ -71,27 +68,6 @@ def test_seeds_never_copy_the_replay():
     assert copies_of_the_ring(compiled) == []
 
 
-def window_shapes(batch: int, steps: int, spec: EnvSpec) -> Window:
-    """Shapes of B contiguous windows."""
-
-    def array(*shape: int, dtype: Any = jnp.float32) -> Any:
-        return jax.ShapeDtypeStruct(shape, dtype)
-
-    return Window(
-        obs=array(batch, steps + 1, spec.obs_size),
-        action=array(batch, steps, spec.action_size),
-        reward=array(batch, steps),
-        discount=array(batch, steps),
-        return_so_far=array(batch, steps + 1),
-        return_to_go=array(batch, steps + 1),
-        time_step=array(batch, steps + 1, dtype=jnp.int32),
-        state_mask=array(batch, steps + 1, dtype=bool),
-        mask=array(batch, steps, dtype=bool),
-        bootstrap_mask=array(batch, steps, dtype=bool),
-        weight=array(batch),
-    )
-
-
 def products_of_an_update(config: Config, spec: EnvSpec) -> int:
     """Floating-point operations of the matrix products, counted by hand (attention's left out)."""
     batch, steps = config.replay.batch_size, config.context.context_length
@@ -117,16 +93,18 @@ def products_of_an_update(config: Config, spec: EnvSpec) -> int:
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="counts differ between backends")
 def test_an_update_does_no_more_than_its_products():
     """At the paper's size; the tenth beyond them is dropout's bits and all that is elementwise."""
-    config = Config.from_preset("paper", env="HalfCheetah", acting_context="window")
-    spec = EnvSpec("HalfCheetah", 17, 6, (-1.0,) * 6, (1.0,) * 6, 1000, "native", "")
-    agent = agents.make(config, spec)
-    key = jax.random.key(0)
-    learner = jax.eval_shape(agent.init, key)
-    hyper = jax.eval_shape(lambda: hyperparameters(config, spec.action_size))
-    window = window_shapes(config.replay.batch_size, config.context.context_length, spec)
-    lowered = jax.jit(agent.update).lower(learner, hyper, window, key)
+    config = Config.from_preset(
+        "paper", env="HalfCheetah", engine="native", acting_context="window"
+    )
+    program, key = make_program(config), jax.random.key(0)
+    state = jax.eval_shape(program.init, key)
+    window = jax.eval_shape(
+        lambda buffer: program.buffer.sample(buffer, key, config.replay.batch_size, 0.99),
+        state.buffer,
+    )
+    lowered = jax.jit(program.agent.update).lower(state.learner, state.hyper, window, key)
     costs: Any = lowered.compile().cost_analysis()
-    expected = products_of_an_update(config, spec)
+    expected = products_of_an_update(config, program.env.spec)
     assert expected < costs["flops"] < 1.1 * expected
 
 

@@ -8,18 +8,15 @@ chunks, and runs `init` and `prefill` on the way, so that a whole start can be t
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from bench.child import answer_of
 from bench.clock import Clock
 from sacformer_jax import Config, make_program
 from sacformer_jax.envs import VectorEnv
@@ -31,7 +28,6 @@ CASES = {"main_job": ("compile", "cpu"), "paper": ("compile.paper", "paper")}
 STARTS = ("cold", "cached")
 FUNCTIONS = ("init", "prefill", "train_chunk", "evaluate")
 LIMIT_SECONDS = 300.0
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def measure(clock: Clock) -> dict[str, float]:
@@ -70,25 +66,17 @@ def start_once(preset: str, cache: Path) -> dict[str, dict[str, float]]:
       RuntimeError: the process failed.
       subprocess.TimeoutExpired: it took longer than ``LIMIT_SECONDS``.
     """
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT / "experiments"),
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
-        # Everything is to be cached, however small and quickly compiled.
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "bench.compiling", preset],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_SECONDS,
+    answer: dict[str, dict[str, float]] = answer_of(
+        "bench.compiling",
+        preset,
+        limit_seconds=LIMIT_SECONDS,
+        environment={
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            # Everything is to be cached, however small and quickly compiled.
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        },
     )
-    if done.returncode:
-        last = (done.stderr.strip() or "no error output").splitlines()[-1]
-        raise RuntimeError(f"preset {preset}: status {done.returncode}: {last}")
-    answer: dict[str, dict[str, float]] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
 
@@ -104,21 +92,14 @@ class Compilations:
     def _on_event(self, event: str, **_: Any) -> None:
         self._hits += event == "/jax/compilation_cache/cache_hits"
 
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        hits, start = self._hits, time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - start
-        self.from_cache[name] = self._hits - hits
-
     def compile(self, name: str, function: Any, *arguments: Any) -> Any:
         """The compiled function: an ahead-of-time one, which never compiles again."""
-        lower_start = time.perf_counter()
+        start = time.perf_counter()
         lowered = function.lower(*arguments)
-        lower_seconds = time.perf_counter() - lower_start
-        with self.timed(name):  # a cache hit is that of this very compilation
-            compiled = lowered.compile()
-        self.seconds[name] += lower_seconds
+        hits = self._hits  # from here on, a hit is that of this very compilation
+        compiled = lowered.compile()
+        self.seconds[name] = time.perf_counter() - start
+        self.from_cache[name] = self._hits - hits
         return compiled
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import resource
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,9 +17,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from bench.child import answer_of
 from bench.clock import Clock
 from bench.update import UPDATES, full_buffer, updater
 from sacformer_jax import Config, make_program
+from sacformer_jax.checkpoint import num_bytes
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.types import TrainState
 
@@ -40,7 +40,6 @@ ITERATIONS = 25
 TRAINING = {"preset": "paper", "prefill_env_steps": 1_000, "chunk_env_steps": 10}
 """Whose memory is told: the paper's settings, for no longer than shows it."""
 LIMIT_SECONDS = 200.0
-ROOT = Path(__file__).resolve().parents[2]
 
 Run = Callable[[], Any]
 
@@ -100,11 +99,6 @@ def in_turns(clock: Clock, runs: Mapping[str, Run], per: int) -> dict[str, float
     return results
 
 
-def num_bytes(tree: Any) -> int:
-    """Of all arrays of a PyTree, or of their shapes."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
-
-
 def transition_bytes(obs_size: int, action_size: int) -> int:
     """The least a step takes: float32 observation, action, reward; terminated, truncated."""
     return 4 * (obs_size + action_size + 1) + 2
@@ -121,17 +115,7 @@ def memory() -> dict[str, float]:
       RuntimeError: it failed.
       subprocess.TimeoutExpired: it took longer than ``LIMIT_SECONDS``.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "bench.scaling"],
-        env={**os.environ, "PYTHONPATH": str(ROOT / "experiments")},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT_SECONDS,
-    )
-    if done.returncode:
-        last = (done.stderr.strip() or "no error output").splitlines()[-1]
-        raise RuntimeError(f"training process: status {done.returncode}: {last}")
-    answer: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    answer: dict[str, float] = answer_of("bench.scaling", limit_seconds=LIMIT_SECONDS)
     return {f"scaling.memory.{what}": float(value) for what, value in answer.items()}
 
 

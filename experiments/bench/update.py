@@ -16,7 +16,14 @@ from sacformer_jax import Config, make_program
 from sacformer_jax.agents import sac_update
 from sacformer_jax.agents.sac_policy import SACParts, window_policies
 from sacformer_jax.train import Program
-from sacformer_jax.types import BufferState, Hyperparameters, LearnerState, Params, TrainState
+from sacformer_jax.types import (
+    BufferState,
+    Hyperparameters,
+    LearnerState,
+    Params,
+    TrainState,
+    Window,
+)
 
 UPDATES = 10
 """Updates in one call, as in training."""
@@ -84,13 +91,20 @@ def updater(program: Program, state: TrainState) -> Callable[[], LearnerState]:
     return repeated(one, state.learner, state.buffer, state.hyper)
 
 
+def batch_of(program: Program, state: TrainState) -> Window:
+    """A batch from the state's replay."""
+    return program.buffer.sample(
+        state.buffer,
+        jax.random.key(0),
+        program.config.replay.batch_size,
+        state.hyper.rtg_discount,
+    )
+
+
 def phases(program: Program, state: TrainState) -> dict[str, Callable[[], Any]]:
     """The parts of an update, each by itself on a batch that stays the same."""
     parts, hyper, learner = sac_parts_of(program), state.hyper, state.learner
-    batch_size = program.config.replay.batch_size
-    window = program.buffer.sample(
-        state.buffer, jax.random.key(0), batch_size, jnp.float32(hyper.rtg_discount)
-    )
+    batch_size, window = program.config.replay.batch_size, batch_of(program, state)
     inputs = sac_update._critic_inputs(parts, learner, window)
 
     def sample(buffer: BufferState, total: jax.Array, key: jax.Array) -> jax.Array:
@@ -154,11 +168,8 @@ def sac_parts_of(program: Program) -> SACParts:
 
 def flops_of(program: Program, state: TrainState) -> float:
     """Floating-point operations of an update without sampling, as XLA counts them."""
-    window = program.buffer.sample(
-        state.buffer, jax.random.key(0), program.config.replay.batch_size, jnp.float32(0.99)
-    )
     update = jax.jit(program.agent.update).lower(
-        state.learner, state.hyper, window, jax.random.key(0)
+        state.learner, state.hyper, batch_of(program, state), jax.random.key(0)
     )
     costs: Any = update.compile().cost_analysis()
     return float(costs["flops"])

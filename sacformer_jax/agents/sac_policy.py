@@ -19,6 +19,7 @@ from sacformer_jax.critics import TwinCritics, make_critics
 from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import ActorOutput, GaussianParams, max_time_step
+from sacformer_jax.transformer import Seen
 from sacformer_jax.types import (
     Acted,
     Cache,
@@ -202,7 +203,11 @@ def window_policies(
     """
 
     def look(
-        actor_params: Params, states: States, action: jax.Array, key: jax.Array, **past: Any
+        actor_params: Params,
+        states: States,
+        action: jax.Array,
+        key: jax.Array,
+        past: Seen | None = None,
     ) -> ActorOutput:
         output: Any = parts.actor.apply(
             actor_params,
@@ -213,7 +218,7 @@ def window_policies(
             states.mask,
             deterministic=False,
             rngs={"dropout": key},
-            **past,
+            past=past,
         )
         return output
 
@@ -233,7 +238,7 @@ def window_policies(
         last = dataclasses.replace(last, mask=window.state_mask)
         unknown = jnp.zeros_like(window.action[:, :1])
         seen = jax.lax.stop_gradient(now.seen)
-        after = look(frozen, last, unknown, following_key, past=seen).gaussian
+        after = look(frozen, last, unknown, following_key, seen).gaussian
         next_gaussian = jax.tree.map(
             lambda a, b: jnp.concatenate([a[:, 1:], b], axis=1), now.gaussian, after
         )

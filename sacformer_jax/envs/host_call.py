@@ -22,7 +22,7 @@ import numpy as np
 HostFunction = Callable[..., Sequence[np.ndarray]]
 """``(*operands) -> results``, NumPy arrays; operands are views that must not be kept or written."""
 
-_METADATA, _EXECUTE, _INTERNAL_ERROR = 1, 3, 13
+_METADATA, _INTERNAL_ERROR = 1, 13
 # The oldest that XLA still takes; what is used here has been in it from the beginning.
 _API_VERSION = (0, 1)
 _DTYPES: dict[int, Any] = {
