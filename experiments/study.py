@@ -221,7 +221,8 @@ class Study:
     def rows(self, name: str) -> list[Row]:
         """A run's evaluations as rows of the table; none if it has not begun."""
         config, folder = self.configs[name], self._folder(name)
-        if not folder.metrics_path.exists():
+        metrics = folder.path / "metrics.jsonl"
+        if not metrics.exists():
             return []
         seconds, total = {}, 0.0
         for record in read_records(folder.timings_path):
@@ -244,7 +245,7 @@ class Study:
                 "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
                 "commit": "+".join(path.read_text().split()) if path.exists() else "unknown",
             }
-            for record in read_records(folder.metrics_path, "eval")
+            for record in read_records(metrics, "eval")
         ]
 
     def read_table(self) -> list[Row]:

@@ -1,6 +1,7 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
-For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`.
+For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
+:func:`extract`; with :class:`Member` and :class:`Devices` of many members on many devices.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
@@ -10,7 +11,11 @@ from sacformer_jax.checkpoint import CheckpointError
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs import VectorEnv, make_env
 from sacformer_jax.evaluate import make_evaluator
+from sacformer_jax.extraction import extract
+from sacformer_jax.loop import DivergedError
+from sacformer_jax.members import Member, seed_members
 from sacformer_jax.policy import Policy, load_policy
+from sacformer_jax.population import Devices, Population, make_population
 from sacformer_jax.runner import RunResult, resume, train
 from sacformer_jax.train import Program, make_program, policy_of
 from sacformer_jax.version import __version__
@@ -19,17 +24,24 @@ __all__ = [
     "CheckpointError",
     "Config",
     "ConfigError",
+    "Devices",
+    "DivergedError",
+    "Member",
     "Policy",
+    "Population",
     "Program",
     "RunResult",
     "VectorEnv",
     "__version__",
     "evaluate",
+    "extract",
     "load_policy",
     "make_env",
     "make_evaluator",
+    "make_population",
     "make_program",
     "policy_of",
     "resume",
+    "seed_members",
     "train",
 ]

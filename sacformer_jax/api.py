@@ -19,6 +19,7 @@ def evaluate(
     gymnasium: bool = False,
     policy: str = "best",
     seed: int = 0,
+    member: str | int | None = None,
 ) -> dict[str, Any]:
     """Evaluates a run's policy under its mean action.
 
@@ -28,6 +29,7 @@ def evaluate(
       gymnasium: in a real ``gymnasium.make`` environment; otherwise jitted on our own.
       policy: ``"best"`` or ``"latest"``.
       seed: of the resets.
+      member: of a run of several, which: its seed in training, or its name.
 
     Returns:
       ``env``, ``episodes``, ``return_mean``, ``return_std``, ``length_mean``, and in Gymnasium the
@@ -35,16 +37,17 @@ def evaluate(
 
     Raises:
       CheckpointError: there is no such run or policy.
-      ConfigError: ``episodes`` is below 1, or the task is not one of Gymnasium's.
+      ConfigError: ``episodes`` is below 1, the task is not one of Gymnasium's, or the run has no
+        such member.
     """
     from sacformer_jax.gymnasium_eval import evaluate_policy
-    from sacformer_jax.runner import summarize
+    from sacformer_jax.loop import summarize
 
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
     if not 0 <= seed < 2**32:
         raise ConfigError(f"seed={seed}: must be at least 0 and below 2**32")
-    loaded = load_policy(run, policy)
+    loaded = load_policy(run, policy, member)
     if gymnasium:
         return evaluate_policy(loaded, episodes, seed).record()
     env = make_training_env(loaded.config, num_envs=episodes)

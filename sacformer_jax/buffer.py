@@ -109,11 +109,15 @@ class TrajectoryBuffer:
             return state.size - jnp.minimum(state.running, state.size)
         return jnp.full(self.num_envs, state.size)
 
-    def can_sample(self, state: BufferState) -> jax.Array:
-        """bool: whether there is any step to draw."""
+    def num_drawable(self, state: BufferState) -> jax.Array:
+        """int32: how many steps (of scattered windows: episodes) windows are drawn at."""
         if state.episodes is not None:
-            return jnp.any(state.episodes.count > 0)
-        return jnp.any(self.eligible(state) > 0)
+            return jnp.sum(state.episodes.count)
+        return jnp.sum(self.eligible(state))
+
+    def can_sample(self, state: BufferState) -> jax.Array:
+        """bool: whether there is anything to draw."""
+        return self.num_drawable(state) > 0
 
     def sample(
         self, state: BufferState, key: jax.Array, batch_size: int, rtg_discount: jax.Array
@@ -242,6 +246,19 @@ class TrajectoryBuffer:
                 mask=known,
             ),
         )
+
+
+def weighted_by_share(window: Window, num_drawable: jax.Array) -> Window:
+    """One shard's windows, weighted so that the steps of all shards weigh the same again.
+
+    Each shard draws as many windows, so where fewer steps are held each is drawn more often.
+
+    Args:
+      window: drawn from this shard's replay.
+      num_drawable: how many steps it holds, :meth:`TrajectoryBuffer.num_drawable`.
+    """
+    weight = jnp.where(num_drawable > 0, window.weight * num_drawable, 0.0)
+    return dataclasses.replace(window, weight=weight)
 
 
 def _in_turns(read: Callable[[Any], Drawn], which: Any) -> Drawn:

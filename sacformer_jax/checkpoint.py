@@ -1,327 +1,199 @@
-"""Run folders: configuration, Orbax checkpoints of the whole train state, exported policies.
-
-A run folder holds::
-
-    config.json        configuration, source of each value, environment facts, package version
-    checkpoints/STEP/  Orbax: "state" (everything), "policy", "metadata"
-    best/STEP/         Orbax: "policy", "metadata" of the best evaluation so far
-    metrics.jsonl      see sacformer_jax.logging
-"""
+"""Writing checkpoints in the background."""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import logging
-from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, TypeVar
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
-from sacformer_jax.agents.core import Agent
+from sacformer_jax import processes, stored
 from sacformer_jax.config import Config
 from sacformer_jax.cores import usable_cores
-from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.train import policy_state
-from sacformer_jax.types import Hyperparameters, PolicyState, TrainState
-from sacformer_jax.version import __version__
+from sacformer_jax.run_folder import Restored, RunConfigFile, RunFolder
+from sacformer_jax.saved_policies import kept_best, prune_best, restore_policy, save_best
+from sacformer_jax.stored import (
+    FORMAT,
+    BestSoFar,
+    CheckpointError,
+    Progress,
+)
+from sacformer_jax.types import PolicyState, TrainState
 
-FORMAT = 1
-"""Version of the layout above; raised when an older program could not read it."""
+__all__ = [
+    "FORMAT",
+    "KEEP",
+    "BestSoFar",
+    "CheckpointError",
+    "CheckpointWriter",
+    "Progress",
+    "Restored",
+    "RunConfigFile",
+    "RunFolder",
+    "kept_best",
+    "prune_best",
+    "restore_policy",
+    "save_best",
+]
+
+Tree = TypeVar("Tree")
+
 KEEP = 2
 """Newest full checkpoints kept, so that a damaged one leaves another."""
 
-logging.getLogger("absl").setLevel(logging.ERROR)
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # its errors are raised as well
 
 
-class CheckpointError(Exception):
-    """A run folder or checkpoint that cannot be used; the message says what would help."""
+class CheckpointWriter:
+    """Writes the checkpoints of a run in the background, one at a time.
 
-
-@dataclasses.dataclass(frozen=True)
-class RunConfigFile:
-    """Contents of ``config.json`` that decide the run: configuration and source of each value."""
-
-    config: Config
-    sources: dict[str, str]
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """What the host loop needs besides the train state, kept in every checkpoint.
-
-    Attributes:
-      env_steps: environment steps so far.
-      metrics_bytes: length of ``metrics.jsonl`` at that moment.
-      best_return: highest evaluation return so far, None before any.
-    """
-
-    env_steps: int
-    metrics_bytes: int
-    best_return: float | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Restored:
-    """A checkpoint read back and verified.
-
-    Attributes:
-      state: the whole train state.
-      progress: of the host loop.
-      host_threads: CPU threads of the process that wrote it; sums are split over them, so only
-        the same number continues bit for bit.
-    """
-
-    state: TrainState
-    progress: Progress
-    host_threads: int
-
-
-def digest(tree: Any) -> str:
-    """SHA-256 over every leaf's path, type, shape and bytes: equal exactly when the trees are."""
-    sha = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            leaf = jax.random.key_data(leaf)
-        array = np.asarray(leaf)
-        sha.update(f"{jax.tree_util.keystr(path)}|{array.dtype}|{array.shape}|".encode())
-        sha.update(array.tobytes())
-    return sha.hexdigest()
-
-
-def num_bytes(tree: Any) -> int:
-    """Bytes of all leaves (arrays or shapes; PRNG keys not counted)."""
-    leaves = [
-        x for x in jax.tree.leaves(tree) if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-    ]
-    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
-
-
-class RunFolder:
-    """A run's folder.
+    A context manager: leaving it waits for the last one. With several processes all have to do
+    the same with it. Only the process that holds the run's lock may use it.
 
     Args:
-      path: the folder, which may not exist yet.
+      folder: of the run.
+      config: kept with each checkpoint, to tell when ``config.json`` was changed.
+      block_axes: of the digests of the state's leaves, a PyTree of ints like it: at least the axes
+        that are split over processes; None: 0 of all.
     """
 
-    def __init__(self, path: str | Path):
-        self.path = Path(path).expanduser().absolute()
+    def __init__(self, folder: RunFolder, config: Config, block_axes: Any = None):
+        self._folder, self._config, self._block_axes = folder, config, block_axes
+        self._manager: ocp.CheckpointManager | None = None
+        self._writing: int | None = None
 
-    @property
-    def metrics_path(self) -> Path:
-        return self.path / "metrics.jsonl"
-
-    @property
-    def timings_path(self) -> Path:
-        return self.path / "timings.jsonl"
-
-    # --- the folder --------------------------------------------------------------------------
-
-    def create(self, config: Config, sources: dict[str, str], spec: EnvSpec) -> None:
-        """Makes the folder and writes ``config.json``.
-
-        Raises:
-          CheckpointError: the folder holds a run with a checkpoint already (one that was stopped
-            before its first may be started again), or cannot be written.
-        """
-        if self.latest_step() is not None:
-            raise CheckpointError(
-                f"run_dir={str(self.path)!r} holds a run already: "
-                f"continue it with 'sacformer resume {self.path}' or choose another folder"
-            )
-        contents = {
-            "format": FORMAT,
-            "version": __version__,
-            "config": config.to_dict(),
-            "sources": sources,
-            "env_spec": dataclasses.asdict(spec),
-        }
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            (self.path / "config.json").write_text(json.dumps(contents, indent=2) + "\n")
-        except OSError as error:
-            raise CheckpointError(
-                f"run_dir={str(self.path)!r} cannot be written ({error.strerror}): "
-                "choose a folder that can"
-            ) from error
-
-    def opened(self) -> RunFolder:
-        """Itself, if it holds a run.
-
-        Raises:
-          CheckpointError: it does not.
-        """
-        if not (self.path / "config.json").is_file():
-            raise CheckpointError(
-                f"run {str(self.path)!r}: no config.json there; give the folder of a run, "
-                "as printed at the start of 'sacformer train'"
-            )
+    def __enter__(self) -> CheckpointWriter:
         return self
 
-    def _config_json(self) -> dict[str, Any]:
-        path = self.path / "config.json"
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         try:
-            contents = json.loads(path.read_text())
-            made_with = contents["format"]
-            if made_with == FORMAT and not {"config", "sources", "env_spec"} <= set(contents):
-                raise KeyError("config, sources or env_spec")
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, OSError) as error:
-            raise CheckpointError(f"{path} is damaged: restore it from a copy") from error
-        if made_with != FORMAT:
-            raise CheckpointError(
-                f"{path} has format {made_with}, this version reads format {FORMAT}: "
-                f"use sacformer-jax {contents.get('version')}"
-            )
-        return contents
-
-    def read_config(self) -> RunConfigFile:
-        """The run's configuration."""
-        contents = self._config_json()
-        config = Config.from_dict(contents["config"])
-        # A run of an earlier version knows no source of later fields: they are at their defaults.
-        sources = dict.fromkeys(config.flat(), "default")
-        return RunConfigFile(config, {**sources, **contents["sources"]})
-
-    def read_spec(self) -> EnvSpec:
-        """Facts of the run's environment, without making it."""
-        values = self._config_json()["env_spec"]
-        for name in ("action_low", "action_high"):
-            values[name] = tuple(values[name])
-        return EnvSpec(**values)
-
-    # --- checkpoints -------------------------------------------------------------------------
+            self.wait()
+        except CheckpointError as failure:
+            if error is None:
+                raise
+            error.add_note(str(failure))  # that one came first
+        finally:
+            self._close()
 
     def save(self, state: TrainState, policy: PolicyState, progress: Progress) -> None:
-        """Writes a checkpoint; returns when it is on disk."""
-        metadata = {
-            "format": FORMAT,
-            "version": __version__,
-            "progress": dataclasses.asdict(progress),
-            "state_digest": digest(state),
-            "policy_digest": digest(policy),
-            "host_threads": usable_cores(),
-        }
-        with self._manager("checkpoints", KEEP) as manager:
-            if progress.env_steps in manager.all_steps():
-                return
-            manager.save(
-                progress.env_steps,
+        """Saves a checkpoint under ``progress.env_steps``, where there is none yet.
+
+        Returns when it has a copy of the arrays, so that they may be donated at once.
+
+        Args:
+          state: of all members.
+          policy: of all members, leaves ``[S, ...]``.
+          progress: of the host loop.
+
+        Raises:
+          CheckpointError: the save before this one failed, and this one was not tried; or this one
+            fails already. Older checkpoints are as they were, and the next call tries again.
+        """
+        self.wait()
+        step = progress.env_steps
+        if processes.of_the_first(step if step in self._folder.steps() else None) is not None:
+            return
+        state, policy = _snapshot(state), _snapshot(policy)
+        each = jax.tree.map(lambda _: 1, policy)
+        metadata = stored.sealed(
+            {
+                "config": self._config.to_dict(),
+                "progress": dataclasses.asdict(progress),
+                "host_threads": usable_cores(),
+                "items": {
+                    "state": stored.described(state, self._block_axes),
+                    "policy": stored.described(policy, each),
+                },
+            }
+        )
+        self._writing = step
+        try:
+            if self._manager is None:
+                self._manager = self._opened()
+            self._manager.save(
+                step,
                 args=ocp.args.Composite(
                     state=ocp.args.StandardSave(state),
                     policy=ocp.args.StandardSave(policy),
                     metadata=ocp.args.JsonSave(metadata),
                 ),
+                force=True,
             )
+        except Exception as error:  # Orbax raises many kinds
+            raise self._failed(error) from error
 
-    def save_best(self, policy: PolicyState, env_steps: int, return_mean: float) -> None:
-        """Writes the best policy so far and removes the one before."""
-        metadata = {
-            "format": FORMAT,
-            "env_steps": env_steps,
-            "return_mean": return_mean,
-            "policy_digest": digest(policy),
-        }
-        with self._manager("best", 1) as manager:
-            if env_steps in manager.all_steps():
-                return
-            manager.save(
-                env_steps,
-                args=ocp.args.Composite(
-                    policy=ocp.args.StandardSave(policy), metadata=ocp.args.JsonSave(metadata)
-                ),
-            )
-
-    def latest_step(self) -> int | None:
-        """Environment steps of the newest checkpoint; None without any."""
-        with self._manager("checkpoints", None) as manager:
-            return manager.latest_step()
-
-    def restore(self, abstract_state: TrainState) -> Restored:
-        """Reads the newest checkpoint and verifies its digest.
-
-        Args:
-          abstract_state: shapes of the train state (``jax.eval_shape(program.init, key)``).
+    def wait(self) -> None:
+        """Returns when the checkpoint given last is on disk.
 
         Raises:
-          CheckpointError: there is none, or it is damaged.
+          CheckpointError: it could not be written.
         """
-        step = self.latest_step()
-        if step is None:
-            raise CheckpointError(
-                f"run {str(self.path)!r} has no checkpoint yet: start it again in a new folder"
-            )
-        items = self._read("checkpoints", step, state=abstract_state)
-        metadata, state = items["metadata"], items["state"]
-        if digest(state) != metadata["state_digest"]:
-            raise CheckpointError(
-                f"checkpoint {self.path / 'checkpoints' / str(step)} is damaged (its digest "
-                "differs): remove that folder to fall back to the one before"
-            )
-        return Restored(state, Progress(**metadata["progress"]), metadata["host_threads"])
+        if self._writing is None or self._manager is None:
+            return
+        try:
+            self._manager.wait_until_finished()
+            if processes.is_first() and self._writing not in self._folder.steps():
+                raise OSError(f"{self._folder.checkpoints_path} lacks it")
+        except Exception as error:
+            raise self._failed(error) from error
+        self._writing = None
+        self._prune()
 
-    def restore_policy(self, agent: Agent, which: str) -> PolicyState:
-        """Reads the ``"best"`` or ``"latest"`` policy and verifies its digest.
-
-        Raises:
-          CheckpointError: there is none, or it is damaged.
-        """
-        folders = {"best": "best", "latest": "checkpoints"}
-        if which not in folders:
-            raise CheckpointError(f"which={which!r}: must be best or latest")
-        folder = folders[which]
-        with self._manager(folder, None) as manager:
-            step = manager.latest_step()
-        if step is None:
-            raise CheckpointError(
-                f"run {str(self.path)!r} has no {which} policy yet: let it train up to its first "
-                + ("evaluation" if which == "best" else "checkpoint")
-            )
-        items = self._read(folder, step, policy=_abstract_policy(agent))
-        if digest(items["policy"]) != items["metadata"]["policy_digest"]:
-            raise CheckpointError(
-                f"policy {self.path / folder / str(step)} is damaged (its digest differs): "
-                f"use the {'latest' if which == 'best' else 'best'} one"
-            )
-        return items["policy"]
-
-    def _read(self, folder: str, step: int, **abstract: Any) -> dict[str, Any]:
-        device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-        targets = {
-            name: jax.tree.map(
-                lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), tree
-            )
-            for name, tree in abstract.items()
-        }
-        restores = {name: ocp.args.StandardRestore(target) for name, target in targets.items()}
-        with self._manager(folder, None) as manager:
-            try:
-                items = manager.restore(
-                    step,
-                    args=ocp.args.Composite(metadata=ocp.args.JsonRestore(), **restores),
-                )
-            except Exception as error:  # Orbax raises many kinds for damaged files
-                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise CheckpointError(
-                    f"checkpoint {self.path / folder / str(step)} cannot be read ({reason[:200]}): "
-                    "if it is damaged, remove that folder to fall back to the one before; if "
-                    "another version of sacformer-jax wrote it, resume with that one"
-                ) from error
-        return {name: items[name] for name in ("metadata", *abstract)}
-
-    def _manager(self, folder: str, keep: int | None) -> ocp.CheckpointManager:
+    def _opened(self) -> ocp.CheckpointManager:
+        path = self._folder.checkpoints_path
+        if processes.is_first():
+            path.mkdir(parents=True, exist_ok=True)
+            stored.remove_unfinished(path)  # of a process that was killed
+        processes.all_here()
         return ocp.CheckpointManager(
-            self.path / folder,
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=keep, create=keep is not None, enable_async_checkpointing=False
-            ),
+            path, options=ocp.CheckpointManagerOptions(max_to_keep=KEEP, create=False)
         )
 
+    def _close(self) -> None:
+        """Lets go of the manager; after a failure it knows no longer what is on disk."""
+        manager, self._manager, self._writing = self._manager, None, None
+        if manager is not None:
+            try:
+                manager.close()
+            except Exception as error:  # of a save that failed and has been reported
+                logging.getLogger(__name__).debug("closing: %s", error)
 
-def _abstract_policy(agent: Agent) -> PolicyState:
-    learner = jax.eval_shape(agent.init, jax.random.key(0))
-    number: Any = jax.ShapeDtypeStruct((), np.float32)
-    fields = {field.name: number for field in dataclasses.fields(Hyperparameters)}
-    return policy_state(learner, Hyperparameters(**fields))
+    def _failed(self, error: Exception) -> CheckpointError:
+        step = self._writing
+        self._close()
+        if processes.is_first():
+            stored.remove_failed(self._folder.checkpoints_path)  # frees the disk
+        return CheckpointError(
+            f"checkpoint {self._folder.checkpoints_path / str(step)} could not be saved "
+            f"({stored.one_line(error)}); the ones before it are as they were"
+        )
+
+    def _prune(self) -> None:
+        """Deletes best policies that no kept checkpoint refers to."""
+        if not processes.is_first():
+            return
+        newest = self._folder.latest_step()
+        for member, keep in zip(
+            self._folder.read_config().members, kept_best(self._folder), strict=True
+        ):
+            # Those after the newest checkpoint will be referred to by the next.
+            steps = stored.steps_in(self._folder.member_path(member.name) / "best")
+            later = {step for step in steps if newest is None or step > newest}
+            prune_best(self._folder, member.name, keep | later)
+
+
+def _snapshot(tree: Tree) -> Tree:
+    """Arrays that stay what they are when the ones given are donated."""
+    # Other devices' arrays are copied to the host before Orbax returns; those of the CPU are not.
+    if jax.default_backend() != "cpu":
+        return tree
+    return jax.tree.map(jnp.copy, tree)

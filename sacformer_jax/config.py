@@ -66,6 +66,8 @@ class RunConfig:
     """Environment steps between checkpoints."""
     chunk_env_steps: int = 1_000
     """Environment steps of one jitted call; evaluations and checkpoints fall between calls."""
+    max_skipped_updates: int = 100
+    """Updates skipped because a tensor was not finite, above which training stops."""
     run_dir: str = ""
     """Folder of the run; empty: a new one under runs/."""
 
@@ -205,7 +207,9 @@ class Config:
     preset: PresetName = "paper"
     """Where the values not given come from; `sacformer describe` prints them all."""
     seed: int = 0
-    """Seed of everything random."""
+    """Seed of everything random; of several seeds the first."""
+    seeds: int | tuple[int, ...] = 1
+    """Seeds trained side by side in one program: how many, from `seed` on, or which."""
     task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
     run: RunConfig = dataclasses.field(default_factory=RunConfig)
     replay: ReplayConfig = dataclasses.field(default_factory=ReplayConfig)
@@ -273,6 +277,13 @@ class Config:
         for name, value in values.items():
             fields.update(value if name in sections and isinstance(value, dict) else {name: value})
         return cls().replace(**fields)
+
+    @property
+    def all_seeds(self) -> tuple[int, ...]:
+        """The seeds that are trained."""
+        if isinstance(self.seeds, tuple):
+            return self.seeds
+        return tuple(range(self.seed, self.seed + self.seeds))
 
     @property
     def steps_and_updates(self) -> tuple[int, int]:

@@ -14,14 +14,16 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn,
 from rich.table import Table
 from rich.text import Text
 
-from sacformer_jax.checkpoint import num_bytes
+from sacformer_jax.digests import num_bytes
 from sacformer_jax.logging import Record
-from sacformer_jax.train import Program
+from sacformer_jax.population import Population
+from sacformer_jax.run_folder import RunFolder
 from sacformer_jax.types import TrainState
 
 
 def _count(params: object) -> str:
-    return f"{sum(leaf.size for leaf in jax.tree.leaves(params)):,}"
+    """Parameters of one member, of leaves that lead with the members."""
+    return f"{sum(leaf.size // leaf.shape[0] for leaf in jax.tree.leaves(params)):,}"
 
 
 class _Speed(ProgressColumn):
@@ -78,9 +80,10 @@ class Reporter:
         yield
         self.say(f"{what}: {time.perf_counter() - start:.1f} s")
 
-    def facts(self, program: Program, state: TrainState, run_path: Path) -> None:
+    def facts(self, population: Population, state: TrainState, run_path: Path) -> None:
         """Says what is about to run."""
-        config, spec = program.config, program.env.spec
+        config, spec = population.config, population.program.env.spec
+        members, devices = population.members, population.devices
         learner = state.learner
         self.say(f"run          {run_path}")
         self.say(
@@ -88,7 +91,15 @@ class Reporter:
             f"{config.task.num_envs} environments"
         )
         self.say(f"engine       {spec.engine} ({spec.engine_reason})")
-        self.say(f"agent        {config.agent}, preset {config.preset}, seed {config.seed}")
+        who = f"seed {members[0].seed}"
+        if len(members) > 1:
+            who = f"{len(members)} members: {', '.join(member.name for member in members)}"
+        self.say(f"agent        {config.agent}, preset {config.preset}, {who}")
+        if devices.members * devices.data > 1:
+            self.say(
+                f"devices      {devices.members} for the members times {devices.data} for the data "
+                f"of each, {jax.process_count()} processes"
+            )
         self.say(
             f"parameters   actor {_count(learner.actor_params)}, "
             f"critics {_count(learner.critic_params)}"
@@ -108,16 +119,60 @@ class Reporter:
         """Moves the bar."""
         self._bar.update(self._task, completed=env_steps)
 
-    def evaluated(self, record: Record) -> None:
-        """Shows an evaluation."""
-        mean, std = record["return_mean"], record["return_std"]
+    def evaluated(self, env_steps: int, records: list[Record]) -> None:
+        """Shows an evaluation of each member."""
+        returns = [record["return_mean"] for record in records]
+        mean = sum(returns) / len(returns)
+        if len(records) == 1:
+            rest = f"± {records[0]['return_std']:.1f}  length {records[0]['length_mean']:.0f}"
+        else:
+            rest = f"mean of {len(records)} members, {min(returns):.1f} to {max(returns):.1f}"
         self._bar.update(self._task, eval_return=f"{mean:.0f}")
         self.say(
-            f"{record['env_steps']:>9,} env steps  {time.perf_counter() - self._started:6.0f} s  "
-            f"eval return {mean:8.1f} ± {std:.1f}  length {record['length_mean']:.0f}"
+            f"{env_steps:>9,} env steps  {time.perf_counter() - self._started:6.0f} s  "
+            f"eval return {mean:8.1f} {rest}"
         )
 
-    def table(self, evaluations: list[Record]) -> None:
+    def closing(
+        self,
+        started: float,
+        folder: RunFolder,
+        env_steps: int,
+        interrupted: bool,
+        evaluations: dict[str, list[Record]],
+    ) -> None:
+        """Says what came of it; ``started`` by ``time.perf_counter``."""
+        if len(evaluations) == 1:
+            self._evaluations(*evaluations.values())
+        else:
+            self._last_evaluations(evaluations)
+        path, say = folder.path, self.say
+        say(f"training time  {time.perf_counter() - started:.0f} s, evaluations included")
+        say(f"checkpoint     {path / 'checkpoints' / str(env_steps)}")
+        say(f"learning curve {path / 'learning_curve.png'}")
+        if interrupted:
+            say(f"stopped at {env_steps:,} env steps; continue with: sacformer resume {path}")
+
+    def _last_evaluations(self, evaluations: dict[str, list[Record]]) -> None:
+        """Prints a row for each member, below the bar."""
+        if not self._bar.disable:
+            self._bar.stop()
+        table = Table(title="evaluations, mean action: the last, and the best")
+        for column in ("member", "env steps", "return", "std", "best", "at env steps"):
+            table.add_column(column, justify="left" if column == "member" else "right")
+        for name, records in evaluations.items():
+            last, best = records[-1], max(records, key=lambda record: record["return_mean"])
+            table.add_row(
+                name,
+                f"{last['env_steps']:,}",
+                f"{last['return_mean']:.1f}",
+                f"{last['return_std']:.1f}",
+                f"{best['return_mean']:.1f}",
+                f"{best['env_steps']:,}",
+            )
+        self.console.print(table)
+
+    def _evaluations(self, evaluations: list[Record]) -> None:
         """Prints the evaluations as a table (at most the last 15), below the bar."""
         if not self._bar.disable:
             self._bar.stop()

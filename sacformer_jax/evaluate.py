@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from sacformer_jax import context as contexts
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.envs.core import VectorEnv, VectorEnvState
+from sacformer_jax.parallel import any_of_all
 from sacformer_jax.types import Context, PolicyState
 
 _ACTING_STREAM = 2**31
@@ -77,7 +78,7 @@ def make_evaluator(
             ),
         )
         progress = jax.lax.while_loop(
-            lambda progress: jnp.any(progress.running),
+            lambda progress: any_of_all(progress.running),
             lambda progress: step(policy, progress),
             progress,
         )

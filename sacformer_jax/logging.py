@@ -6,14 +6,16 @@ two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``u
 ``kind = "train"``, one line a chunk; means over its updates, or over the episodes finished in it
 (``null`` where none finished):
   ``episodes``, ``episode_return_mean``, ``episode_return_max``, ``episode_length_mean``,
-  ``bad_physics`` (steps dropped), ``critic_loss``, ``actor_loss``, ``q_mean``, ``entropy`` (nats),
-  ``alpha``, ``actor_grad_norm``, ``critic_grad_norm``.
+  ``bad_physics`` (steps dropped), ``skipped_updates`` (those with a tensor that was not finite;
+  they are in no mean), ``critic_loss``, ``actor_loss``, ``q_mean``, ``entropy`` (nats), ``alpha``,
+  ``actor_grad_norm``, ``critic_grad_norm``.
 ``kind = "eval"``, one line an evaluation:
   ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``.
 
-``timings.jsonl`` has a line a chunk: ``env_steps``, ``updates``, ``chunk_seconds``,
-``steps_per_second``, ``ms_per_update``, ``wall_seconds`` (training time since the program started
-or resumed, evaluations included).
+Of several members each has such a file of its own; ``timings.jsonl`` is the run's and has a line a
+chunk: ``env_steps``, ``updates``, ``chunk_seconds``, ``steps_per_second``, ``ms_per_update`` (each
+over all members), ``wall_seconds`` (training time since the program started or resumed, evaluations
+included).
 """
 
 from __future__ import annotations
@@ -38,63 +40,72 @@ def plain(value: Any) -> Any:
     return number
 
 
-class MetricLog:
-    """Appends records to a run's ``metrics.jsonl``, ``timings.jsonl`` and TensorBoard.
+class _Log:
+    """Appends records to a JSONL file, and their numbers to TensorBoard."""
+
+    def __init__(self, path: Path, keep_bytes: int, tensorboard_dir: Path, purge_after: int | None):
+        self._file = _open_cut(path, keep_bytes)
+        self._writer = SummaryWriter(
+            str(tensorboard_dir),
+            purge_step=0 if purge_after is None else purge_after + 1,
+            filename_suffix=f".{path.stem}",
+        )
+
+    def _append(self, tag: str, record: Record) -> None:
+        self._file.write(json.dumps(record).encode() + b"\n")
+        self._file.flush()
+        for name, value in record.items():
+            if isinstance(value, int | float) and name not in ("env_steps", "updates"):
+                self._writer.add_scalar(f"{tag}/{name}", value, record["env_steps"])
+
+    def close(self) -> None:
+        """Flushes and closes all files."""
+        self._file.close()
+        self._writer.close()
+
+
+class MetricLog(_Log):
+    """Appends records to a member's ``metrics.jsonl`` and TensorBoard.
 
     Args:
-      metrics_path: the JSONL file of metrics.
-      timings_path: the JSONL file of timings.
+      path: the JSONL file.
       tensorboard_dir: folder of TensorBoard events.
-      keep_bytes: length to cut ``metrics.jsonl`` back to, when a run is resumed.
-      purge_after: environment steps after which timings and TensorBoard events are dropped, on
-        resume; None drops all of them, for a run that starts.
+      keep_bytes: length to cut the file back to, when a run is resumed.
+      purge_after: environment steps after which TensorBoard events are dropped, on resume; None
+        drops all of them, for a run that starts.
     """
 
     def __init__(
         self,
-        metrics_path: Path,
-        timings_path: Path,
+        path: Path,
         tensorboard_dir: Path,
         keep_bytes: int = 0,
         purge_after: int | None = None,
     ):
-        self._metrics = _open_cut(metrics_path, keep_bytes)
-        self._timings = _open_cut(timings_path, _timing_bytes(timings_path, purge_after))
-        purge_step = 0 if purge_after is None else purge_after + 1
-        self._writer = SummaryWriter(str(tensorboard_dir), purge_step=purge_step)
+        super().__init__(path, keep_bytes, tensorboard_dir, purge_after)
 
     @property
-    def metrics_bytes(self) -> int:
-        """Length of ``metrics.jsonl``, everything written so far included."""
-        self._metrics.flush()
-        return self._metrics.tell()
+    def num_bytes(self) -> int:
+        """Length of the file, everything written so far included."""
+        return self._file.tell()
 
     def write(self, kind: str, env_steps: int, updates: int, values: Record) -> Record:
         """Appends a record of metrics and returns it as written."""
         record = {"kind": kind, "env_steps": env_steps, "updates": updates}
         record.update({name: plain(value) for name, value in values.items()})
-        self._metrics.write(json.dumps(record).encode() + b"\n")
-        self._metrics.flush()
-        self._scalars(kind, record, env_steps)
+        self._append(kind, record)
         return record
 
-    def write_timing(self, env_steps: int, updates: int, values: Record) -> None:
+
+class TimingLog(_Log):
+    """Appends records to a run's ``timings.jsonl`` and TensorBoard; arguments as above."""
+
+    def __init__(self, path: Path, tensorboard_dir: Path, purge_after: int | None = None):
+        super().__init__(path, _timing_bytes(path, purge_after), tensorboard_dir, purge_after)
+
+    def write(self, env_steps: int, updates: int, values: Record) -> None:
         """Appends a record of timings."""
-        record = {"env_steps": env_steps, "updates": updates, **values}
-        self._timings.write(json.dumps(record).encode() + b"\n")
-        self._timings.flush()
-        self._scalars("timing", values, env_steps)
-
-    def _scalars(self, kind: str, values: Record, env_steps: int) -> None:
-        for name, value in values.items():
-            if isinstance(value, int | float) and name != "env_steps":
-                self._writer.add_scalar(f"{kind}/{name}", value, env_steps)
-
-    def close(self) -> None:
-        """Flushes and closes all files."""
-        self._metrics.close()
-        self._timings.close()
-        self._writer.close()
+        self._append("timing", {"env_steps": env_steps, "updates": updates, **values})
 
 
 def _open_cut(path: Path, keep_bytes: int) -> BinaryIO:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from sacformer_jax.parallel import UNDIVIDED, DataAxis
 from sacformer_jax.types import Normalizer
 
 CLIP = 10.0
@@ -16,12 +17,12 @@ def init(obs_size: int) -> Normalizer:
     return Normalizer(jnp.zeros((), jnp.int32), jnp.zeros(obs_size), jnp.zeros(obs_size))
 
 
-def update(normalizer: Normalizer, obs: jax.Array) -> Normalizer:
-    """Adds a batch of observations ``[..., O]``."""
-    obs = obs.reshape(-1, obs.shape[-1])  # [M, O]
-    batch_count = obs.shape[0]
-    batch_mean = obs.mean(axis=0)
-    batch_m2 = jnp.sum((obs - batch_mean) ** 2, axis=0)
+def update(normalizer: Normalizer, obs: jax.Array, data: DataAxis = UNDIVIDED) -> Normalizer:
+    """Adds a batch of observations ``[..., O]``, of each shard."""
+    obs = jnp.asarray(obs).reshape(-1, obs.shape[-1])  # [M, O]
+    batch_count = obs.shape[0] * data.size
+    batch_mean = data.sum(_sum_in_pairs(obs)) / batch_count
+    batch_m2 = data.sum(_sum_in_pairs((obs - batch_mean) ** 2))
     count = normalizer.count + batch_count
     share = batch_count / count
     delta = batch_mean - normalizer.mean
@@ -30,6 +31,19 @@ def update(normalizer: Normalizer, obs: jax.Array) -> Normalizer:
         mean=normalizer.mean + delta * share,
         m2=normalizer.m2 + batch_m2 + delta**2 * normalizer.count * share,
     )
+
+
+def _sum_in_pairs(x: jax.Array) -> jax.Array:
+    """Sum over the first axis, halves added until one is left.
+
+    The order is the same under ``vmap``, unlike that of XLA's reductions, so that a seed gets the
+    same bits alone and beside others.
+    """
+    while x.shape[0] > 1:
+        half = x.shape[0] // 2
+        paired = x[:half] + x[half : 2 * half]  # [half, ...]
+        x = paired if x.shape[0] % 2 == 0 else paired.at[0].add(x[-1])
+    return x[0]
 
 
 def normalize(normalizer: Normalizer, obs: jax.Array) -> jax.Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import flax.struct
@@ -10,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sacformer_jax import agents, checkpoint
+from sacformer_jax import agents
 from sacformer_jax import context as contexts
 from sacformer_jax.agents.core import Agent
-from sacformer_jax.config import Config
+from sacformer_jax.checkpoint import RunFolder, restore_policy
+from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.members import Member
 from sacformer_jax.types import Acted, PolicyState
 
 
@@ -136,17 +139,41 @@ class Policy:
         return _Memory(self.agent.act(state, context, act_key, explore=False), key)
 
 
-def load_policy(path: str | Path, which: str = "best") -> Policy:
+def load_policy(path: str | Path, which: str = "best", member: str | int | None = None) -> Policy:
     """Loads a policy from a run, without its replay.
 
     Args:
       path: the run's folder.
       which: ``"best"`` (highest evaluation return) or ``"latest"``.
+      member: of a run of several, which: its seed, or its name.
 
     Raises:
       CheckpointError: there is no run or no such policy, or it is damaged.
+      ConfigError: the run has no such member, or several and none was named.
     """
-    run = checkpoint.RunFolder(path).opened()
-    config, spec = run.read_config().config, run.read_spec()
+    folder = RunFolder(path).opened()
+    run, spec = folder.read_config(), folder.read_spec()
+    index = member_index(run.members, member)
+    config = run.members[index].config(run.config)
     agent = agents.make(config, spec)
-    return Policy(config, spec, agent, run.restore_policy(agent, which))
+    return Policy(config, spec, agent, restore_policy(folder, agent, which, index))
+
+
+def member_index(members: Sequence[Member], member: str | int | None) -> int:
+    """The place of a member given by seed or name; of the only one by None.
+
+    Raises:
+      ConfigError: see :func:`load_policy`.
+    """
+    names = ", ".join(each.name for each in members)
+    if member is None:
+        if len(members) > 1:
+            raise ConfigError(f"member=None: the run has several; say which: {names}")
+        return 0
+    found = [
+        index for index, each in enumerate(members) if str(member) in (each.name, str(each.seed))
+    ]
+    if len(found) != 1:
+        problem = "there is none such" if not found else "there are several such"
+        raise ConfigError(f"member={member!r}: {problem}; the run has {names}")
+    return found[0]

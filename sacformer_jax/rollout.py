@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from sacformer_jax import context as contexts
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.envs.core import VectorEnv, VectorEnvState
+from sacformer_jax.parallel import DataAxis
 from sacformer_jax.types import Acted, BufferState, Cache, Context, Transition
 
 
@@ -49,6 +50,16 @@ class RolloutStats:
             return_max=self.return_max.max(),
             length_sum=self.length_sum.sum(),
             bad_physics=self.bad_physics.sum(),
+        )
+
+    def over_shards(self, data: DataAxis) -> RolloutStats:
+        """Sums (and maximum) over the shards of the environments."""
+        return RolloutStats(
+            episodes=data.count(self.episodes),
+            return_sum=data.sum(self.return_sum),
+            return_max=data.max(self.return_max),
+            length_sum=data.count(self.length_sum),
+            bad_physics=data.count(self.bad_physics),
         )
 
 
@@ -112,4 +123,4 @@ def collect(
         return next_state, (stats, transition.obs)
 
     state, (stats, obs) = jax.lax.scan(one_step, state, jax.random.split(key, num_steps))
-    return state, stats.total(), obs
+    return state, stats.total().over_shards(env.data), obs

@@ -16,9 +16,11 @@ import jax.numpy as jnp
 
 from sacformer_jax import agents, normalizer, rollout
 from sacformer_jax.agents.core import Agent
-from sacformer_jax.buffer import TrajectoryBuffer
+from sacformer_jax.agents.faults import NO_FAULT
+from sacformer_jax.buffer import TrajectoryBuffer, weighted_by_share
 from sacformer_jax.config import Config
 from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.parallel import UNDIVIDED, DataAxis
 from sacformer_jax.rollout import RolloutState, RolloutStats
 from sacformer_jax.types import (
     Acted,
@@ -49,7 +51,7 @@ class Program:
       env: the vectorized training environment.
       agent: the algorithm.
       buffer: the replay's functions.
-      init: ``key -> TrainState``.
+      init: ``(key, hyper) -> TrainState``; without ``hyper`` it is :func:`hyperparameters`.
       prefill: ``TrainState -> (TrainState, metrics)``, random actions; the argument is donated.
       train_chunk: ``TrainState -> (TrainState, metrics)``, one chunk; the argument is donated.
       update: ``(buffer state, hyper, learner, key) -> (learner, metrics)``, one gradient update on
@@ -66,30 +68,38 @@ class Program:
     update: UpdateFromReplay
 
 
-def make_training_env(config: Config, num_envs: int | None = None) -> VectorEnv:
+def make_training_env(
+    config: Config, num_envs: int | None = None, data: DataAxis = UNDIVIDED
+) -> VectorEnv:
     """The configuration's environment, vectorized; ``num_envs`` other than its own if given."""
     task = config.task
     env = make_env(task.env, task.engine, task.brax_backend, task.mjx_preset, task.mjx_impl)
-    return VectorEnv(env, task.num_envs if num_envs is None else num_envs, task.max_episode_steps)
+    num_envs = task.num_envs if num_envs is None else num_envs
+    return VectorEnv(env, num_envs, task.max_episode_steps, data)
 
 
-def make_program(config: Config, env: VectorEnv | None = None) -> Program:
+def make_program(
+    config: Config, env: VectorEnv | None = None, data: DataAxis = UNDIVIDED
+) -> Program:
     """Binds a valid configuration to its pure functions.
 
     Args:
       config: see :meth:`Config.validated`.
       env: use this vectorized environment instead of the one ``config.task`` names.
+      data: how environments, replay and batch are split; with more than one shard the functions
+        are those of a shard (see :class:`~sacformer_jax.parallel.DataAxis`), and ``env``, where
+        given, must be split alike.
 
     Raises:
       ConfigError: a setting cannot work.
       ValueError: the environment does not exist.
     """
     config.validated()
-    env = make_training_env(config) if env is None else env
-    agent = agents.make(config, env.spec)
+    env = make_training_env(config, data=data) if env is None else env
+    agent = agents.make(config, env.spec, data)
     buffer = TrajectoryBuffer(
         num_envs=env.num_envs,
-        length=config.replay.buffer_capacity // env.num_envs,
+        length=config.replay.buffer_capacity // (env.num_envs * data.size),
         obs_size=env.spec.obs_size,
         action_size=env.spec.action_size,
         context_length=config.context.context_length,
@@ -125,6 +135,7 @@ def hyperparameters(config: Config, action_size: int) -> Hyperparameters:
         "return_scale": context.return_scale,
         "hindsight_scale": context.hindsight_scale or context.return_scale,
         "rtg_discount": context.rtg_discount,
+        "alpha": sac.alpha,
     }
     return Hyperparameters(**{name: jnp.float32(value) for name, value in numbers.items()})
 
@@ -153,18 +164,21 @@ class _TrainingFunctions:
     agent: Agent
     buffer: TrajectoryBuffer
 
-    def init(self, key: jax.Array) -> TrainState:
+    def init(self, key: jax.Array, hyper: Hyperparameters | None = None) -> TrainState:
+        if hyper is None:
+            hyper = hyperparameters(self.config, self.env.spec.action_size)
         key, learner_key, env_key = jax.random.split(key, 3)
         cache = self.agent.init_cache(self.env.num_envs)
         start = rollout.start(self.env, self.buffer, cache, env_key)
         zero = jnp.zeros((), jnp.int32)
+        learner = self.agent.init(learner_key)
         return TrainState(
-            learner=self.agent.init(learner_key),
-            hyper=hyperparameters(self.config, self.env.spec.action_size),
+            learner=dataclasses.replace(learner, log_alpha=jnp.log(hyper.alpha)),
+            hyper=hyper,
             env=start.env,
             context=start.context,
             buffer=start.buffer,
-            counters=Counters(zero, zero, zero, zero),
+            counters=Counters(zero, zero, zero, jnp.int32(NO_FAULT), zero, zero),
             key=key,
         )
 
@@ -186,8 +200,7 @@ class _TrainingFunctions:
         state, (stats, update_metrics) = jax.lax.scan(
             scanned, state, length=self.config.iterations_per_chunk
         )
-        means = jax.tree.map(jnp.mean, update_metrics)
-        return state, {**_episode_metrics(stats.total()), **means}
+        return state, {**_episode_metrics(stats.total()), **_update_means(update_metrics)}
 
     def _iteration(self, state: TrainState) -> tuple[TrainState, tuple[RolloutStats, Metrics]]:
         """Collects, then updates; metrics lead with the update axis."""
@@ -205,14 +218,22 @@ class _TrainingFunctions:
             state.learner,
             jax.random.split(updates_key, num_updates),
         )
+        done, skipped = jnp.int32(num_updates), metrics["fault"] != NO_FAULT
         if self.buffer.scattered:
             # Episodes shorter than K may leave nothing to learn from; momentum must not move on.
-            learnt = self.buffer.can_sample(state.buffer)
+            learnt = self.env.data.count(self.buffer.num_drawable(state.buffer)) > 0
             learner = jax.tree.map(partial(jnp.where, learnt), learner, state.learner)
-            done = jnp.where(learnt, num_updates, 0)
-        else:
-            done = jnp.int32(num_updates)
-        counters = dataclasses.replace(state.counters, updates=state.counters.updates + done)
+            done, skipped = jnp.where(learnt, done, 0), skipped & learnt
+        counters = state.counters
+        first_here = jnp.where(jnp.any(skipped), metrics["fault"][jnp.argmax(skipped)], NO_FAULT)
+        counters = dataclasses.replace(
+            counters,
+            updates=counters.updates + done,
+            skipped_updates=counters.skipped_updates + jnp.sum(skipped, dtype=jnp.int32),
+            first_fault=jnp.where(
+                counters.first_fault == NO_FAULT, first_here, counters.first_fault
+            ),
+        )
         return dataclasses.replace(state, learner=learner, counters=counters, key=key), (
             stats,
             metrics,
@@ -221,9 +242,14 @@ class _TrainingFunctions:
     def update(
         self, buffer: BufferState, hyper: Hyperparameters, learner: LearnerState, key: jax.Array
     ) -> tuple[LearnerState, Metrics]:
+        data = self.env.data
         sample_key, update_key = jax.random.split(key)
-        batch_size = self.config.replay.batch_size
-        window = self.buffer.sample(buffer, sample_key, batch_size, hyper.rtg_discount)
+        batch_size = self.config.replay.batch_size // data.size
+        window = self.buffer.sample(
+            buffer, data.own_key(sample_key), batch_size, hyper.rtg_discount
+        )
+        if data.size > 1:
+            window = weighted_by_share(window, self.buffer.num_drawable(buffer))
         return self.agent.update(learner, hyper, window, update_key)
 
     def _collect(
@@ -241,7 +267,8 @@ class _TrainingFunctions:
         learner = state.learner
         if self.config.context.normalize_obs:
             learner = dataclasses.replace(
-                learner, normalizer=normalizer.update(learner.normalizer, obs)
+                learner,
+                normalizer=normalizer.update(learner.normalizer, obs, self.env.data),
             )
         hyper, counters = state.hyper, state.counters
         if self.config.context.target_return == "auto":
@@ -249,7 +276,7 @@ class _TrainingFunctions:
             hyper = dataclasses.replace(hyper, target_return=best)
         counters = dataclasses.replace(
             counters,
-            env_steps=counters.env_steps + num_steps * self.env.num_envs,
+            env_steps=counters.env_steps + num_steps * self.env.num_envs * self.env.data.size,
             episodes=counters.episodes + stats.episodes,
             bad_physics=counters.bad_physics + stats.bad_physics,
         )
@@ -264,6 +291,17 @@ class _TrainingFunctions:
             key=key,
         )
         return state, stats
+
+
+def _update_means(metrics: Metrics) -> Metrics:
+    """Means over the updates that were not skipped (NaN without any), and how many were."""
+    fault = metrics.pop("fault")
+    sound = fault == NO_FAULT
+    means = {
+        name: jnp.sum(jnp.where(sound, values, 0.0)) / jnp.sum(sound)
+        for name, values in metrics.items()
+    }
+    return {**means, "skipped_updates": jnp.sum(~sound, dtype=jnp.int32)}
 
 
 def _episode_metrics(stats: RolloutStats) -> Metrics:

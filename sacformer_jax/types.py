@@ -205,6 +205,7 @@ class Hyperparameters:
       return_scale: every return-to-go is divided by it before the network sees it.
       hindsight_scale: hindsight return-to-go is divided by this instead of ``return_scale``.
       rtg_discount: discount of hindsight return-to-go.
+      alpha: entropy temperature at the start, or for good where it is not tuned.
     """
 
     actor_learning_rate: jax.Array
@@ -217,6 +218,7 @@ class Hyperparameters:
     return_scale: jax.Array
     hindsight_scale: jax.Array
     rtg_discount: jax.Array
+    alpha: jax.Array
 
 
 @flax.struct.dataclass
@@ -260,13 +262,17 @@ class Counters:
 
     Attributes:
       env_steps: environment steps, prefill included.
-      updates: gradient updates.
+      updates: gradient updates, those skipped included.
+      skipped_updates: updates skipped, wholly or in part, because a tensor was not finite.
+      first_fault: which tensor that was the first time, by its place in ``Agent.checked``; or -1.
       episodes: finished episodes.
       bad_physics: steps dropped because the simulation broke down.
     """
 
     env_steps: jax.Array
     updates: jax.Array
+    skipped_updates: jax.Array
+    first_fault: jax.Array
     episodes: jax.Array
     bad_physics: jax.Array
 

@@ -41,9 +41,12 @@ def check(config: Config) -> None:
             )
     for name in _AT_MOST_ONE:
         _require(values[name] <= 1, f"{name}={values[name]}: must be at most 1")
-    for name in ("discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise"):
+    for name in (
+        "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
+        "max_skipped_updates",
+    ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
-    _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
+    _check_seeds(config)
     _check_actor(config)
     _check_policy(config)
     _check_window(config)
@@ -51,6 +54,18 @@ def check(config: Config) -> None:
     _check_acting(config)
     _check_critic(config)
     _check_steps(config)
+
+
+def _check_seeds(config: Config) -> None:
+    _require(config.seed < 2**32, f"seed={config.seed}: must be below 2**32")
+    seeds = config.seeds
+    if isinstance(seeds, int):
+        _require(seeds >= 1, f"seeds={seeds}: must be at least 1")
+    else:
+        _require(len(seeds) >= 2, f"seeds={seeds}: name two or more, or give how many")
+        _require(len(set(seeds)) == len(seeds), f"seeds={seeds}: each must differ from the others")
+    for seed in config.all_seeds:
+        _require(0 <= seed < 2**32, f"seeds={seeds}: {seed} must be at least 0 and below 2**32")
 
 
 def _check_actor(config: Config) -> None:

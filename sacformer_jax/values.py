@@ -35,6 +35,10 @@ def _alternatives(union: Any) -> tuple[tuple[Any, ...], Any]:
 
 def coerced(name: str, value: Any, kind: Any) -> Any:
     """``value`` as the field's type, where nothing is lost by it."""
+    if kind == int | tuple[int, ...]:
+        if isinstance(value, list | tuple):
+            return tuple(coerced(name, each, int) for each in value)
+        kind = int
     if isinstance(kind, python_types.UnionType) or typing.get_origin(kind) is typing.Union:
         words, kind = _alternatives(kind)
         if value is None or isinstance(value, str):

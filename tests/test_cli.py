@@ -20,6 +20,7 @@ from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, main
 from sacformer_jax.config import field_places
 from sacformer_jax.envs import EnvSpec
+from sacformer_jax.members import seed_members
 from sacformer_jax.presets import resolve
 from sacformer_jax.runner import sources_of
 
@@ -275,14 +276,13 @@ def test_paths_that_are_no_run_are_refused(run, args: list[str], tmp_path: Path)
 def run_without_checkpoint(tmp_path: Path) -> Path:
     config = Config.from_preset("cpu", **TINY)
     spec = EnvSpec("Hopper", 11, 3, (-1.0,) * 3, (1.0,) * 3, 1000, "native", "test", "Hopper-v5")
-    RunFolder(tmp_path / "run").create(config, sources_of(config), spec)
+    RunFolder(tmp_path / "run").create(config, sources_of(config), spec, seed_members([0]))
     return tmp_path / "run"
 
 
 @pytest.mark.parametrize(
     ("command", "flags", "mentioned"),
     [
-        ("resume", [], "no checkpoint yet"),
         ("evaluate", [], "no best policy yet"),
         ("evaluate", ["--policy", "latest"], "no latest policy yet"),
         ("evaluate", ["--episodes", "0"], "episodes=0"),

@@ -9,8 +9,8 @@ import jax
 import pytest
 from probe import EPISODE, point_config, point_env
 
-from sacformer_jax.checkpoint import num_bytes
 from sacformer_jax.config import Config
+from sacformer_jax.digests import num_bytes
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.train import make_program
 

@@ -15,8 +15,9 @@ PACKAGE = "sacformer_jax"
 # Each module may import only from earlier lines, and from its own line where that is a folder or
 # the settings. A new module needs a place here.
 ARROW: tuple[tuple[str, ...], ...] = (
-    ("version", "cores", "values"),
+    ("version", "cores", "values", "parallel"),
     ("config", "validation", "presets"),
+    ("members",),
     ("envs",),
     ("types",),
     ("layers", "distributions"),
@@ -28,14 +29,20 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("agents",),
     ("train",),
     ("evaluate",),
+    ("population",),
     # Here the outside world begins.
-    ("logging",),
+    ("logging", "processes", "digests", "memory"),
+    ("stored",),
+    ("restoring", "lock"),
+    ("run_folder",),
+    ("saved_policies",),
     ("checkpoint",),
-    ("plots", "console", "compilation_cache"),
+    ("plots", "console", "compilation_cache", "launch"),
     ("policy",),
-    ("gymnasium_eval",),
-    ("runner",),
+    ("gymnasium_eval", "loop"),
+    ("extraction", "runner"),
     ("api",),
+    ("commands",),
     ("cli",),
     ("__init__",),
 )

@@ -11,13 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sacformer_jax.logging import MetricLog, plain, read_records
+from sacformer_jax.logging import MetricLog, TimingLog, plain, read_records
 
 
 def _open(folder: Path, **kwargs: Any) -> MetricLog:
-    return MetricLog(
-        folder / "metrics.jsonl", folder / "timings.jsonl", folder / "tensorboard", **kwargs
-    )
+    return MetricLog(folder / "metrics.jsonl", folder / "tensorboard", **kwargs)
+
+
+def _open_timings(folder: Path, purge_after: int | None = None) -> TimingLog:
+    return TimingLog(folder / "timings.jsonl", folder / "tensorboard" / "timings", purge_after)
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
@@ -77,29 +79,24 @@ def test_records_are_appended_as_json_lines(tmp_path: Path) -> None:
 def test_a_record_is_on_disk_at_once(tmp_path: Path) -> None:
     log = _open(tmp_path)
     record = log.write("eval", 1, 0, {"return_mean": 1.0})
-    log.write_timing(1, 0, {"chunk_seconds": 0.5})
+    timings = _open_timings(tmp_path)
+    timings.write(1, 0, {"chunk_seconds": 0.5})
     assert _lines(tmp_path / "metrics.jsonl") == [record]
     assert _lines(tmp_path / "timings.jsonl") == [
         {"env_steps": 1, "updates": 0, "chunk_seconds": 0.5}
     ]
     log.close()
-
-
-def test_timings_stay_out_of_the_metrics(tmp_path: Path) -> None:
-    log = _open(tmp_path)
-    log.write_timing(10, 5, {"chunk_seconds": 0.25})
-    log.close()
-    assert (tmp_path / "metrics.jsonl").read_bytes() == b""
+    timings.close()
 
 
 def test_metrics_bytes_counts_everything_written(tmp_path: Path) -> None:
     log = _open(tmp_path)
-    assert log.metrics_bytes == 0
+    assert log.num_bytes == 0
     log.write("train", 1, 1, {"loss": 1.0})
-    one = log.metrics_bytes
+    one = log.num_bytes
     assert one == (tmp_path / "metrics.jsonl").stat().st_size > 0
     log.write("train", 2, 2, {"loss": 1.0})
-    assert log.metrics_bytes == 2 * one
+    assert log.num_bytes == 2 * one
     log.close()
 
 
@@ -107,13 +104,13 @@ def test_resuming_cuts_the_metrics_back_and_goes_on_after(tmp_path: Path) -> Non
     path = tmp_path / "metrics.jsonl"
     log = _open(tmp_path)
     kept = log.write("eval", 100, 0, {"return_mean": 1.0})
-    keep_bytes = log.metrics_bytes
+    keep_bytes = log.num_bytes
     log.write("eval", 200, 0, {"return_mean": 2.0})
     log.close()
     path.write_bytes(path.read_bytes() + b'{"kind": "train", "env_st')  # killed while writing
 
     log = _open(tmp_path, keep_bytes=keep_bytes, purge_after=100)
-    assert log.metrics_bytes == keep_bytes
+    assert log.num_bytes == keep_bytes
     again = log.write("eval", 200, 0, {"return_mean": 3.0})
     log.close()
     assert _lines(path) == [kept, again]
@@ -132,14 +129,14 @@ def test_timings_are_cut_back_to_where_the_run_goes_on(
     tmp_path: Path, purge_after: int | None, kept: list[int]
 ) -> None:
     path = tmp_path / "timings.jsonl"
-    log = _open(tmp_path)
+    log = _open_timings(tmp_path)
     for env_steps in (1, 2, 3):
-        log.write_timing(env_steps, 0, {"chunk_seconds": 0.5})
+        log.write(env_steps, 0, {"chunk_seconds": 0.5})
     log.close()
     path.write_bytes(path.read_bytes() + b'{"env_st')  # killed while writing
 
-    log = _open(tmp_path, purge_after=purge_after)
-    log.write_timing(9, 0, {"chunk_seconds": 0.5})
+    log = _open_timings(tmp_path, purge_after)
+    log.write(9, 0, {"chunk_seconds": 0.5})
     log.close()
     assert [line["env_steps"] for line in _lines(path)] == [*kept, 9]
 
@@ -147,13 +144,15 @@ def test_timings_are_cut_back_to_where_the_run_goes_on(
 def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
     log = _open(tmp_path)
     log.write("eval", 100, 0, {"return_mean": 1.0})
-    log.write_timing(100, 0, {"chunk_seconds": 0.5})
     log.close()
-    (events,) = (tmp_path / "tensorboard").iterdir()
-    content = events.read_bytes()
-    assert b"eval/return_mean" in content
-    assert b"timing/chunk_seconds" in content
-    assert b"env_steps" not in content  # it is the axis
+    timings = _open_timings(tmp_path)
+    timings.write(100, 0, {"chunk_seconds": 0.5})
+    timings.close()
+    for folder, tag in (("", b"eval/return_mean"), ("timings", b"timing/chunk_seconds")):
+        # One file in each folder: TensorBoard follows one at a time.
+        (events,) = (f for f in (tmp_path / "tensorboard" / folder).iterdir() if f.is_file())
+        assert tag in events.read_bytes()
+        assert b"env_steps" not in events.read_bytes()  # it is the axis
 
 
 def test_read_records_by_kind(tmp_path: Path) -> None:

@@ -26,13 +26,14 @@ from sacformer_jax import (
     agents,
     evaluate,
     load_policy,
-    make_program,
+    make_population,
     resume,
     runner,
     train,
 )
-from sacformer_jax.checkpoint import RunFolder, digest
+from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cores import usable_cores
+from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
 from sacformer_jax.train import hyperparameters, policy_state
 from sacformer_jax.types import Context
@@ -103,8 +104,12 @@ def _contents(path: Path) -> dict[str, bytes]:
 def _state_digest(path: Path) -> str:
     """Digest of the whole train state of the newest checkpoint."""
     folder = RunFolder(path)
-    program = make_program(folder.read_config().config)
-    return digest(folder.restore(jax.eval_shape(program.init, jax.random.key(0))).state)
+    run = folder.read_config()
+    population = make_population(run.config, run.members)
+    restored = folder.restore(
+        population.abstract(), population.block_axes, population.shardings, move_aside=False
+    )
+    return digest(restored.state, population.block_axes)
 
 
 # --- resuming ----------------------------------------------------------------------------------
@@ -162,7 +167,7 @@ def test_resuming_on_other_cores_says_that_it_is_not_exact(
 ) -> None:  # fmt: skip
     here = usable_cores()
     monkeypatch.setattr(runner, "usable_cores", lambda: here + 1)
-    monkeypatch.setattr(runner._Loop, "run", lambda *_: resumed.result)
+    monkeypatch.setattr(runner, "_train_on", lambda *_: resumed.result)
     resume(_killed(straight, tmp_path / "run"))
     note = f"note: saved with {here} CPU threads, continued with {here + 1}"
     assert note in " ".join(capsys.readouterr().out.split())
@@ -216,8 +221,8 @@ def test_metrics_come_when_they_should(straight: Outcome) -> None:
 
 TRAIN_FIELDS = {
     "episodes", "episode_return_mean", "episode_return_max", "episode_length_mean", "bad_physics",
-    "critic_loss", "actor_loss", "q_mean", "entropy", "alpha", "actor_grad_norm",
-    "critic_grad_norm",
+    "skipped_updates", "critic_loss", "actor_loss", "q_mean", "entropy", "alpha",
+    "actor_grad_norm", "critic_grad_norm",
 }  # fmt: skip
 EVAL_FIELDS = {
     "episodes", "return_mean", "return_std", "return_min", "return_max", "length_mean",

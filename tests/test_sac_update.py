@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,10 @@ from gpt2 import gaussian_of
 from probe import point_config, point_env
 
 from sacformer_jax import agents
-from sacformer_jax.agents.sac_update import bellman_target, soft_update, weighted_mean
+from sacformer_jax.agents.sac_update import bellman_target, soft_update, step_weights
 from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.networks import TransformerActor
+from sacformer_jax.parallel import DataAxis
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.transformer import TransformerConfig
 from sacformer_jax.types import States, Window
@@ -94,10 +96,22 @@ def test_bellman_target_at_ordinary_and_terminated_steps():
     np.testing.assert_allclose(y, [[9.1, 2.0]], rtol=1e-6)
 
 
-def test_weighted_mean_and_soft_update():
-    values = jnp.array([[1.0, 2.0], [3.0, 100.0]])
-    assert weighted_mean(values, jnp.array([[0.5, 0.5], [1.0, 0.0]])) == pytest.approx(2.25)
-    assert weighted_mean(values, jnp.zeros((2, 2))) == 0.0
+def test_step_weights():
+    window = make_window().replace(
+        weight=jnp.array([0.5, 1.0, 0.0, 0.0, 0.0]),
+        mask=jnp.ones((B, K), bool).at[1, 1:].set(False),
+        bootstrap_mask=jnp.ones((B, K), bool).at[:, 1:].set(False),
+    )
+    parts = SimpleNamespace(data=DataAxis())
+    weights = step_weights(parts, window)  # 3 x 0.5 + 1, and 0.5 + 1
+    np.testing.assert_allclose(weights.actor[:2], [[0.2] * 3, [0.4, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(weights.critic[:2], [[1 / 3, 0, 0], [2 / 3, 0, 0]], rtol=1e-6)
+    nothing = step_weights(parts, window.replace(weight=jnp.zeros(B)))
+    assert not nothing.actor.any()
+    assert not nothing.critic.any()
+
+
+def test_soft_update():
     moved = soft_update({"w": jnp.array([1.0])}, {"w": jnp.array([3.0])}, jnp.float32(0.005))
     np.testing.assert_allclose(moved["w"], [1.01])
 

@@ -18,6 +18,7 @@ from sacformer_jax import Config
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs import EnvSpec
+from sacformer_jax.members import seed_members
 from sacformer_jax.runner import sources_of
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -39,9 +40,10 @@ def _pretend(study: studies.Study, name: str, returns: list[float], commits: str
     """A run's folder with what the table is made of, an evaluation every 100 steps."""
     config = study.configs[name]
     folder = RunFolder(config.run.run_dir)
-    folder.create(config, sources_of(config), SPEC)
+    folder.create(config, sources_of(config), SPEC, seed_members([config.seed]))
     steps = range(100, 100 * len(returns) + 1, 100)
-    with folder.metrics_path.open("w") as metrics, folder.timings_path.open("w") as timings:
+    metrics_path = folder.path / "metrics.jsonl"
+    with metrics_path.open("w") as metrics, folder.timings_path.open("w") as timings:
         for step, value in zip(steps, returns, strict=True):
             record = {"env_steps": step, "return_mean": value, "return_std": 0.5, "episodes": 2}
             metrics.write(json.dumps({"kind": "train", "env_steps": step}) + "\n")

@@ -87,33 +87,6 @@ def test_counts_and_compiles_once(program):
     assert program.train_chunk._cache_size() == 1
 
 
-def test_seeds_vmap_with_cache_and_table_of_episodes():
-    """Through prefill exactly, and one chunk of updates within rounding."""
-    config = point_config(
-        acting_context="episode", window="scattered", return_conditioning="hindsight",
-        chunk_env_steps=40,
-    )  # fmt: skip
-    program = make_program(config, point_env(4))
-    keys = jnp.stack([jax.random.key(seed) for seed in (3, 4)])
-    state = jax.jit(jax.vmap(program.init))(keys)
-    prefilled, _ = jax.jit(jax.vmap(program.prefill))(state)
-    together, _ = jax.jit(jax.vmap(program.train_chunk))(prefilled)
-    for i, seed in enumerate((3, 4)):
-        alone = started(program, seed)
-        for a, b in zip(
-            jax.tree.leaves(prefilled.buffer), jax.tree.leaves(alone.buffer), strict=True
-        ):
-            np.testing.assert_array_equal(a[i], b)
-        alone, _ = program.train_chunk(alone)
-        for part in ("learner", "context", "buffer"):
-            for a, b in zip(
-                jax.tree.leaves(getattr(together, part)),
-                jax.tree.leaves(getattr(alone, part)),
-                strict=True,
-            ):
-                np.testing.assert_allclose(a[i], b, atol=1e-4)
-
-
 class ShortEnv(PointEnv):
     """Terminates at once: no episode is as long as a window."""
 

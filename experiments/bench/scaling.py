@@ -21,7 +21,7 @@ from bench.child import answer_of
 from bench.clock import Clock
 from bench.update import UPDATES, full_buffer, updater
 from sacformer_jax import Config, make_program
-from sacformer_jax.checkpoint import num_bytes
+from sacformer_jax.digests import num_bytes
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.types import TrainState
 

@@ -6,10 +6,11 @@ from sacformer_jax.agents import sac, sacformer
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.parallel import UNDIVIDED, DataAxis
 
 _MAKERS = {"sacformer": sacformer.make, "sac": sac.make}
 
 
-def make(config: Config, spec: EnvSpec) -> Agent:
-    """Builds the agent ``config.agent`` names."""
-    return _MAKERS[config.agent](config, spec)
+def make(config: Config, spec: EnvSpec, data: DataAxis = UNDIVIDED) -> Agent:
+    """Builds the agent ``config.agent`` names; ``data`` says how batches are split over devices."""
+    return _MAKERS[config.agent](config, spec, data)

@@ -59,10 +59,14 @@ class Agent:
       init: makes the learner state.
       init_cache: makes what a context keeps of its whole episode; empty where that is nothing.
       act: chooses actions from contexts.
-      update: one gradient update on a batch of windows.
+      update: one gradient update on a batch of windows. Where a tensor is not finite the networks
+        that it would reach stay as they are; the metric ``fault`` is its place in ``checked``, or
+        -1.
+      checked: names of the tensors that are looked at, in the order in which they come about.
     """
 
     init: Init
     init_cache: InitCache
     act: Act
     update: Update
+    checked: tuple[str, ...]

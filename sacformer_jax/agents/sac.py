@@ -8,9 +8,10 @@ from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import MLPActor
+from sacformer_jax.parallel import DataAxis
 
 
-def make(config: Config, spec: EnvSpec) -> Agent:
+def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
     """Builds SAC for an environment."""
     actor = MLPActor(
         widths=(config.actor.actor_width,) * config.actor.actor_layers,
@@ -19,4 +20,4 @@ def make(config: Config, spec: EnvSpec) -> Agent:
         head_init_scale=config.actor.head_init_scale,
         dtype=config.precision.compute_dtype,
     )
-    return make_sac_agent(sac_parts(config, spec, actor))
+    return make_sac_agent(sac_parts(config, spec, data, actor))

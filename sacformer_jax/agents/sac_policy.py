@@ -19,6 +19,7 @@ from sacformer_jax.critics import TwinCritics, make_critics
 from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import ActorOutput, GaussianParams, max_time_step
+from sacformer_jax.parallel import DataAxis
 from sacformer_jax.transformer import Seen
 from sacformer_jax.types import (
     Acted,
@@ -55,6 +56,7 @@ class SACParts:
       tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
       initial_alpha: α at the start.
       normalize_obs: use the running observation statistics.
+      data: how environments and batches are split over devices.
     """
 
     actor: nn.Module
@@ -70,10 +72,15 @@ class SACParts:
     tune_alpha: bool
     initial_alpha: float
     normalize_obs: bool
+    data: DataAxis
 
 
 def sac_parts(
-    config: Config, spec: EnvSpec, actor: nn.Module, acting_actor: nn.Module | None = None
+    config: Config,
+    spec: EnvSpec,
+    data: DataAxis,
+    actor: nn.Module,
+    acting_actor: nn.Module | None = None,
 ) -> SACParts:
     """The parts that a configuration and an environment ask for, around ``actor``."""
     return SACParts(
@@ -95,6 +102,7 @@ def sac_parts(
         tune_alpha=config.sac.tune_alpha,
         initial_alpha=config.sac.alpha,
         normalize_obs=config.context.normalize_obs,
+        data=data,
     )
 
 
@@ -149,14 +157,14 @@ def act(
         context.time_step,
         context.mask,
         deterministic=not parts.acting_dropout,
-        rngs={"dropout": jax.random.fold_in(key, _DROPOUT_STREAM)},
+        rngs={"dropout": parts.data.own_key(jax.random.fold_in(key, _DROPOUT_STREAM))},
         mutable=["cache"],
     )
     acted, changed = output
     gaussian = acted.gaussian
     mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
     if explore:
-        noise = jax.random.normal(key, mean.shape)
+        noise = parts.data.normal(key, mean.shape)
         action = parts.distribution.sample_and_log_prob(noise, mean, log_std)[0]
     else:
         action = parts.distribution.mode(mean)

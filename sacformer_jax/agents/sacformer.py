@@ -8,10 +8,11 @@ from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import TransformerActor, max_time_step
+from sacformer_jax.parallel import DataAxis
 from sacformer_jax.transformer import TransformerConfig
 
 
-def make(config: Config, spec: EnvSpec) -> Agent:
+def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
     """Builds SACFormer for an environment."""
     settings = config.actor
     actor = TransformerActor(
@@ -35,4 +36,4 @@ def make(config: Config, spec: EnvSpec) -> Agent:
         steps = spec.max_episode_steps
         limit = min(config.context.acting_context_limit or steps, steps)
         acting_actor = actor.clone(context_length=limit, cached=True)
-    return make_sac_agent(sac_parts(config, spec, actor, acting_actor))
+    return make_sac_agent(sac_parts(config, spec, data, actor, acting_actor))

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.parallel import UNDIVIDED, DataAxis, any_of_all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +122,7 @@ class JaxEnv:
         keys: jax.Array,
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
         prepared = jax.lax.cond(
-            jnp.any(refill),
+            any_of_all(refill),
             lambda: where_tree(refill, jax.vmap(self.reset)(keys), prepared),
             lambda: prepared,
         )
@@ -183,21 +184,36 @@ class VectorEnv:
 
     Args:
       env: the environment.
-      num_envs: N.
+      num_envs: how many in all.
       max_episode_steps: the time limit; default: the environment's own.
+      data: how they are split over devices; N is one shard's share. Keys are those of one device.
+
+    Attributes:
+      num_envs: N.
 
     Raises:
-      ConfigError: ``num_envs`` or ``max_episode_steps`` is below 1.
+      ConfigError: ``num_envs`` or ``max_episode_steps`` is below 1, or the shards do not divide
+        ``num_envs``.
     """
 
-    def __init__(self, env: Env, num_envs: int, max_episode_steps: int | None = None):
+    def __init__(
+        self,
+        env: Env,
+        num_envs: int,
+        max_episode_steps: int | None = None,
+        data: DataAxis = UNDIVIDED,
+    ):
         if num_envs < 1:
             raise ConfigError(f"num_envs={num_envs}: must be at least 1")
+        if num_envs % data.size:
+            raise ConfigError(
+                f"num_envs={num_envs}: must be a multiple of data_devices={data.size}"
+            )
         limit = env.spec.max_episode_steps if max_episode_steps is None else max_episode_steps
         if limit < 1:
             raise ConfigError(f"max_episode_steps={limit}: must be at least 1")
         self.env = env
-        self.num_envs = num_envs
+        self.data, self.num_envs = data, num_envs // data.size
         self.max_episode_steps = limit
         self.spec = dataclasses.replace(env.spec, max_episode_steps=limit)
 
@@ -205,12 +221,12 @@ class VectorEnv:
         """N fresh episodes, and as many prepared."""
         key, start_key, prepared_key = jax.random.split(key, 3)
         reset = jax.vmap(self.env.reset)
-        env_state, obs = reset(jax.random.split(start_key, self.num_envs))
+        env_state, obs = reset(self._keys(start_key))
         return VectorEnvState(
             env=env_state,
             obs=obs,
             time_step=jnp.zeros(self.num_envs, jnp.int32),
-            prepared=reset(jax.random.split(prepared_key, self.num_envs)),
+            prepared=reset(self._keys(prepared_key)),
             refill=jnp.zeros(self.num_envs, bool),
             key=key,
         )
@@ -218,9 +234,9 @@ class VectorEnv:
     def step(self, state: VectorEnvState, action: jax.Array) -> tuple[VectorEnvState, VectorStep]:
         """Steps all environments under ``action [N, A]`` and resets those that finished."""
         # One split: on CPU each costs more than the numbers it makes.
-        keys = jax.random.split(state.key, 1 + self.num_envs)
+        keys = jax.random.split(state.key, 1 + self.num_envs * self.data.size)
         (env_state, step), prepared = self.env.step_and_refill(
-            state.env, action, state.refill, state.prepared, keys[1:]
+            state.env, action, state.refill, state.prepared, self.data.rows(keys[1:])
         )
         bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
         time_step = state.time_step + 1
@@ -252,5 +268,9 @@ class VectorEnv:
     def random_action(self, key: jax.Array) -> jax.Array:
         """Uniform actions within the bounds, ``[N, A]``."""
         low, high = np.asarray(self.spec.action_low), np.asarray(self.spec.action_high)
-        shape = (self.num_envs, self.spec.action_size)
-        return jax.random.uniform(key, shape, jnp.float32, low, high)
+        shape = (self.num_envs * self.data.size, self.spec.action_size)
+        return self.data.rows(jax.random.uniform(key, shape, jnp.float32, low, high))
+
+    def _keys(self, key: jax.Array) -> jax.Array:
+        """A key for each environment."""
+        return self.data.rows(jax.random.split(key, self.num_envs * self.data.size))

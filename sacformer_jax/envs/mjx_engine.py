@@ -24,6 +24,7 @@ from sacformer_jax.envs.core import where_tree
 from sacformer_jax.envs.native import load_model
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise
 from sacformer_jax.envs.tasks import Quantities, Task
+from sacformer_jax.parallel import any_of_all
 
 with contextlib.redirect_stdout(None):  # MJX prints that it could do without warp
     from mujoco import mjx
@@ -186,7 +187,7 @@ class MjxEngine:
     ) -> tuple[PhysicsOutput, PhysicsOutput]:
         stepped = jax.vmap(self.step)(states, ctrls)
         zeros = jax.tree.map(jnp.zeros_like, stepped)
-        fresh = jax.lax.cond(jnp.any(reset), lambda: jax.vmap(self.reset)(noise), lambda: zeros)
+        fresh = jax.lax.cond(any_of_all(reset), lambda: jax.vmap(self.reset)(noise), lambda: zeros)
         return stepped, where_tree(reset, fresh, zeros)
 
     def _substep(self, data: mjx.Data) -> mjx.Data:

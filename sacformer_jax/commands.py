@@ -1,0 +1,153 @@
+"""The commands that look at runs: ``sacformer evaluate | describe | extract``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from sacformer_jax.presets import Resolved
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateArgs:
+    """Evaluate a run's policy under its mean action."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    gymnasium: bool = False
+    """In a real gymnasium.make environment, beside random actions; otherwise on our own."""
+    episodes: int = 10
+    """Number of episodes."""
+    policy: Literal["best", "latest"] = "best"
+    """Which policy: best or latest."""
+    member: str | None = None
+    """Of a run of several, which: its seed in training, or its name; default: each."""
+    seed: int = 0
+    """Seed of the resets."""
+    json: bool = False
+    """Print a JSON line (for each member) instead of a table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DescribeArgs:
+    """Print a run's settings, their sources, counters and digest."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    json: bool = False
+    """Print JSON; it holds the config, the counters and a SHA-256 digest of the train state."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExtractArgs:
+    """Write some members of a run as a run of its own."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    to: Path
+    """Folder of the new run."""
+    members: tuple[str, ...]
+    """Their seeds, or names."""
+
+
+def evaluate(args: list[str]) -> int:
+    """``sacformer evaluate``."""
+    from sacformer_jax import api
+    from sacformer_jax.checkpoint import RunFolder
+    from sacformer_jax.gymnasium_eval import evaluate_random
+
+    parsed = tyro.cli(EvaluateArgs, args=args, prog="sacformer evaluate")
+    members: list[str | None] = [parsed.member]
+    if parsed.member is None:
+        names = [member.name for member in RunFolder(parsed.run).opened().read_config().members]
+        members = [*names] if len(names) > 1 else [None]
+    rows: dict[str, dict[str, Any]] = {}
+    for member in members:
+        record = api.evaluate(
+            parsed.run,
+            episodes=parsed.episodes,
+            gymnasium=parsed.gymnasium,
+            policy=parsed.policy,
+            seed=parsed.seed,
+            member=member,
+        )
+        if parsed.json:
+            print(json.dumps(record if member is None else {"member": member, **record}))
+        rows[f"{parsed.policy} policy" + (f" of {member}" if member else "")] = record
+    if parsed.json:
+        return 0
+    if parsed.gymnasium:
+        baseline = evaluate_random(record["env"], parsed.episodes, parsed.seed)
+        rows["random actions"] = baseline.record()
+    print(f"{record['env']}, {parsed.episodes} episodes")
+    width = max(15, *(len(name) for name in rows))
+    for name, row in rows.items():
+        print(
+            f"  {name:<{width}} return {row['return_mean']:9.1f} ± {row['return_std']:.1f}   "
+            f"length {row['length_mean']:.0f}"
+        )
+    return 0
+
+
+def describe_run(args: list[str]) -> int:
+    """``sacformer describe RUN``."""
+    from sacformer_jax.agents.faults import NO_FAULT
+    from sacformer_jax.checkpoint import RunFolder
+    from sacformer_jax.digests import digest
+    from sacformer_jax.population import make_population
+
+    parsed = tyro.cli(DescribeArgs, args=args, prog="sacformer describe")
+    folder = RunFolder(parsed.run).opened()
+    run = folder.read_config()
+    names = [member.name for member in run.members]
+    state_facts: dict[str, Any] = {"counters": None, "digest": None}
+    if folder.latest_step() is not None:
+        population = make_population(run.config, run.members)
+        state = folder.restore(
+            population.abstract(), population.block_axes, population.shardings, move_aside=False
+        ).state
+        counters = {name: np.asarray(value) for name, value in vars(state.counters).items()}
+        # A number where there is one member or they have it in common.
+        state_facts["counters"] = {
+            name: int(value.reshape(-1)[0]) if value.size == 1 else value.tolist()
+            for name, value in counters.items()
+        }
+        faults = np.atleast_1d(state.counters.first_fault).tolist()
+        checked = population.program.agent.checked
+        named = [None if fault == NO_FAULT else checked[fault] for fault in faults]
+        state_facts["counters"]["first_fault"] = named[0] if len(named) == 1 else named
+        state_facts["digest"] = digest(state, population.block_axes)
+    if parsed.json:
+        facts = {"config": run.config.to_dict(), "sources": run.sources, "members": names}
+        print(json.dumps({**facts, **state_facts}))
+        return 0
+    print_config(Resolved(run.config, run.sources))
+    if len(names) > 1:
+        print(f"{'members':<24}{', '.join(names)}")
+    for name, value in (state_facts["counters"] or {}).items():
+        each = value if isinstance(value, list) else [value]
+        print(f"{name:<24}{', '.join(f'{v:,}' if isinstance(v, int) else str(v) for v in each)}")
+    print(f"{'digest':<24}{state_facts['digest']}")
+    return 0
+
+
+def print_config(resolved: Resolved) -> None:
+    """Every setting and where it comes from."""
+    for name, value in resolved.config.flat().items():
+        shown = repr(value) if value in ("", None) else str(value)
+        print(f"{name:<24}{shown:<15} {resolved.sources[name]}")
+
+
+def extract(args: list[str]) -> int:
+    """``sacformer extract``."""
+    from sacformer_jax import extraction
+
+    parsed = tyro.cli(ExtractArgs, args=args, prog="sacformer extract")
+    path = extraction.extract(parsed.run, parsed.members, parsed.to)
+    print(f"written to {path}; continue it with: sacformer resume {path}")
+    return 0

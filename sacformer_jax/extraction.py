@@ -1,0 +1,83 @@
+"""Taking members out of a run: a run folder of their own, to be resumed alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from sacformer_jax.checkpoint import CheckpointWriter, RunFolder
+from sacformer_jax.config import Config, ConfigError
+from sacformer_jax.members import Member
+from sacformer_jax.policy import member_index
+from sacformer_jax.population import make_population
+from sacformer_jax.train import policy_of
+
+
+def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> Path:
+    """Writes some members of a run, as of its newest good checkpoint, as a run of its own.
+
+    Their train states, metrics and best policies go with them; the run itself stays as it is. One
+    member becomes a run like any other, with its seed and settings in the configuration.
+
+    Args:
+      path: the run's folder.
+      members: their seeds or names, each once.
+      to: the new run's folder.
+
+    Returns:
+      the new folder.
+
+    Raises:
+      ConfigError: no such member, or one twice.
+      CheckpointError: there is no checkpoint, or the new folder holds a run or cannot be written.
+    """
+    folder, target = RunFolder(path).opened(), RunFolder(to)
+    run = folder.read_config()
+    places = [member_index(run.members, member) for member in members]
+    if not places or len(set(places)) < len(places):
+        raise ConfigError(f"members={list(members)}: name at least one, and each once")
+    chosen = tuple(run.members[place] for place in places)
+    population = make_population(run.config, run.members)
+    restored = folder.restore(
+        population.abstract(), population.block_axes, population.shardings, move_aside=False
+    )
+    state = jax.tree.map(
+        lambda spec, leaf: leaf[np.array(places)] if len(spec) else leaf,
+        population.specs,
+        restored.state,
+    )
+    progress = dataclasses.replace(
+        restored.progress,
+        best=tuple(restored.progress.best[place] for place in places),
+        metrics_bytes=tuple(restored.progress.metrics_bytes[place] for place in places),
+    )
+    config = _config_of(run.config, chosen).replace(run_dir=str(target.path))
+    if len(chosen) == 1:
+        chosen = (Member(chosen[0].name, chosen[0].seed),)  # its settings are the run's own now
+    target.create(config, run.sources, folder.read_spec(), chosen)
+    for member, place, num_bytes in zip(chosen, places, progress.metrics_bytes, strict=True):
+        source, goal = (
+            folder.member_path(run.members[place].name), target.member_path(member.name)
+        )  # fmt: skip
+        goal.mkdir(exist_ok=True)
+        metrics = folder.metrics_path(run.members[place].name).read_bytes()[:num_bytes]
+        target.metrics_path(member.name).write_bytes(metrics)
+        if (source / "best").is_dir():
+            shutil.copytree(source / "best", goal / "best")
+    with CheckpointWriter(target, config, population.block_axes) as writer:
+        writer.save(state, policy_of(state), progress)
+    return target.path
+
+
+def _config_of(config: Config, members: Sequence[Member]) -> Config:
+    if len(members) == 1:
+        return members[0].config(config)
+    if any(member.values for member in members):
+        return config
+    seeds = tuple(member.seed for member in members)
+    return config.replace(seed=seeds[0], seeds=seeds)
