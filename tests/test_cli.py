@@ -20,6 +20,7 @@ from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, main
 from sacformer_jax.config import field_places
 from sacformer_jax.envs import EnvSpec
+from sacformer_jax.launch import Launch
 from sacformer_jax.members import seed_members
 from sacformer_jax.presets import resolve
 from sacformer_jax.runner import sources_of
@@ -93,7 +94,8 @@ def test_help_of_train_has_every_field(run, monkeypatch: pytest.MonkeyPatch) -> 
     assert said.code == 0
     places = field_places()
     entries = re.findall(r"^[\s│]*(--[a-z][a-z-]*)", said.out, re.MULTILINE)
-    assert sorted(entries) == sorted(_flag(name) for name in places)
+    launch = {_flag(field.name) for field in dataclasses.fields(Launch)}
+    assert sorted(entries) == sorted({_flag(name) for name in places} | launch)
     text = _squeezed(said.out)
     flat = Config.from_preset("cpu").flat()
     for name in places:
@@ -460,7 +462,10 @@ def test_stopped_and_ended_runs_are_resumed_to_the_same(run, runs: Runs) -> None
     assert ended["counters"] == stopped["counters"]
     assert ended["counters"]["env_steps"] == runs.total
     assert ended["counters"]["updates"] == runs.total - 200
-    assert set(ended["counters"]) == {"env_steps", "updates", "episodes", "bad_physics"}
+    assert set(ended["counters"]) == {
+        "env_steps", "updates", "skipped_updates", "first_fault", "episodes", "bad_physics",
+    }  # fmt: skip
+    assert ended["counters"]["first_fault"] is None
     metrics = [(runs.folder / name / "metrics.jsonl").read_bytes() for name in ("ended", "stopped")]
     assert metrics[0] == metrics[1]
 
@@ -476,7 +481,8 @@ def test_describe_a_run(run, runs: Runs) -> None:
     assert described["sources"]["tau"].startswith("default")
     table = run("describe", path).out
     for name, value in described["counters"].items():
-        assert re.search(rf"^{name} +{value:,}$", table, re.MULTILINE)
+        shown = str(value) if value is None else f"{value:,}"
+        assert re.search(rf"^{name} +{shown}$", table, re.MULTILINE)
     assert described["digest"] in table
     assert [line.split()[0] for line in table.splitlines()][: len(given.flat())] == [*given.flat()]
 

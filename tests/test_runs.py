@@ -155,6 +155,22 @@ def test_a_prefill_without_a_long_enough_episode_is_refused(tmp_path: Path) -> N
     assert train(changed, quiet=True).env_steps == 300
 
 
+def test_a_run_killed_before_its_first_checkpoint_starts_from_the_beginning(
+    straight: Outcome, tmp_path: Path
+) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    shutil.copy(straight.result.path / "config.json", path)
+    # What it had written by then is of no use.
+    (path / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 200}\n{"kind": "tr')
+    shutil.copytree(straight.result.path / "best", path / "best")
+    assert resume(path, quiet=True).evaluations == straight.result.evaluations
+    assert _state_digest(path) == _state_digest(straight.result.path)
+    assert (path / "metrics.jsonl").read_bytes() == (
+        straight.result.path / "metrics.jsonl"
+    ).read_bytes()
+
+
 def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed: Outcome) -> None:
     assert resumed.result.evaluations == straight.result.evaluations
     assert not resumed.result.interrupted
