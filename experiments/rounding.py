@@ -8,6 +8,7 @@ first sooner than the third does. Writes results/rounding.json and results/round
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,9 @@ def nudged(state: TrainState) -> TrainState:
     flat = np.array(leaves[place]).reshape(-1)
     flat[0] = np.nextafter(flat[0], np.float32(np.inf))
     leaves[place] = jnp.asarray(flat.reshape(leaves[place].shape))
-    learner = state.learner.replace(actor_params=jax.tree.unflatten(structure, leaves))
-    copy: TrainState = jax.tree.map(jnp.copy, state.replace(learner=learner))
+    params = jax.tree.unflatten(structure, leaves)
+    learner = dataclasses.replace(state.learner, actor_params=params)
+    copy: TrainState = jax.tree.map(jnp.copy, dataclasses.replace(state, learner=learner))
     return copy
 
 

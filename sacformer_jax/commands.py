@@ -108,9 +108,9 @@ def describe_run(args: list[str]) -> int:
     state_facts: dict[str, Any] = {"counters": None, "digest": None}
     if folder.latest_step() is not None:
         population = make_population(run.config, run.members)
-        state = folder.restore(
-            population.abstract(), population.block_axes, population.shardings, move_aside=False
-        ).state
+        block_axes = population.stored(population.block_axes)
+        abstract = population.stored(population.abstract())
+        state = folder.restore(abstract, block_axes, move_aside=False).state
         counters = {name: np.asarray(value) for name, value in vars(state.counters).items()}
         # A number where there is one member or they have it in common.
         state_facts["counters"] = {
@@ -121,7 +121,7 @@ def describe_run(args: list[str]) -> int:
         checked = population.program.agent.checked
         named = [None if fault == NO_FAULT else checked[fault] for fault in faults]
         state_facts["counters"]["first_fault"] = named[0] if len(named) == 1 else named
-        state_facts["digest"] = digest(state, population.block_axes)
+        state_facts["digest"] = digest(state, block_axes)
     if parsed.json:
         facts = {"config": run.config.to_dict(), "sources": run.sources, "members": names}
         print(json.dumps({**facts, **state_facts}))

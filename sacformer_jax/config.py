@@ -64,6 +64,8 @@ class RunConfig:
     """Episodes of each evaluation, under the mean action."""
     checkpoint_every: int = 20_000
     """Environment steps between checkpoints."""
+    checkpoint_replay: bool = True
+    """Checkpoints hold the replay and the running episodes; else resuming collects them anew."""
     chunk_env_steps: int = 1_000
     """Environment steps of one jitted call; evaluations and checkpoints fall between calls."""
     max_skipped_updates: int = 100

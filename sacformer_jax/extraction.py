@@ -43,12 +43,12 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
         raise ConfigError(f"members={list(members)}: name at least one, and each once")
     chosen = tuple(run.members[place] for place in places)
     population = make_population(run.config, run.members)
-    restored = folder.restore(
-        population.abstract(), population.block_axes, population.shardings, move_aside=False
-    )
+    block_axes = population.stored(population.block_axes)
+    abstract = population.stored(population.abstract())
+    restored = folder.restore(abstract, block_axes, move_aside=False)
     state = jax.tree.map(
         lambda spec, leaf: leaf[np.array(places)] if len(spec) else leaf,
-        population.specs,
+        population.stored(population.specs),
         restored.state,
     )
     progress = dataclasses.replace(
@@ -69,7 +69,7 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
         target.metrics_path(member.name).write_bytes(metrics)
         if (source / "best").is_dir():
             shutil.copytree(source / "best", goal / "best")
-    with CheckpointWriter(target, config, population.block_axes) as writer:
+    with CheckpointWriter(target, config, block_axes) as writer:
         writer.save(state, policy_of(state), progress)
     return target.path
 

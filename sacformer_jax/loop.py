@@ -117,7 +117,11 @@ class Loop:
             try:
                 self._open_logs(stack)
                 writer = stack.enter_context(
-                    CheckpointWriter(self.folder, self.config, self.population.block_axes)
+                    CheckpointWriter(
+                        self.folder,
+                        self.config,
+                        self.population.stored(self.population.block_axes),
+                    )
                 )
                 return self._chunks(state, train_chunk, writer)
             except OSError as error:
@@ -276,7 +280,7 @@ class Loop:
             best=tuple(self.best),
             metrics_bytes=tuple(log.num_bytes for log in self._logs),
         )
-        writer.save(state, policy_of(state), progress)
+        writer.save(self.population.stored(state), policy_of(state), progress)
 
 
 def _crossed(every: int, before: int, now: int) -> bool:

@@ -107,6 +107,7 @@ class Population:
       shardings: the same as shardings.
       init: ``() -> TrainState``.
       prefill: ``TrainState -> (TrainState, metrics [S])``; the argument is donated.
+      refill: what checkpoints hold (:meth:`stored`) -> ``(TrainState, metrics [S])``.
       train_chunk: ``TrainState -> (TrainState, metrics [S])``; the argument is donated.
       evaluate: ``(policies [S, ...], env_steps) -> Evaluation [S, E]``, by the members' seeds.
       num_drawable: ``BufferState -> [S]``, see
@@ -120,6 +121,7 @@ class Population:
     shardings: TrainState
     init: Callable[[], TrainState]
     prefill: jax.stages.Wrapped
+    refill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
     evaluate: Callable[[PolicyState, Any], Evaluation]
     num_drawable: jax.stages.Wrapped
@@ -136,6 +138,12 @@ class Population:
     def abstract(self) -> TrainState:
         """Shapes of the state."""
         return jax.eval_shape(self.init)
+
+    def stored(self, state: TrainState) -> TrainState:
+        """What checkpoints hold of a state, or of a tree like it; None where they do not."""
+        if self.config.run.checkpoint_replay:
+            return state
+        return without_replay(state)
 
 
 def stacked_hyperparameters(
@@ -206,6 +214,7 @@ def make_population(
         shardings=jax.tree.map(split.sharding, specs),
         init=lambda: init_all(seeds, hyper),
         prefill=split(program.prefill, (specs,), chunk_specs, donate=True),
+        refill=split(program.refill, (without_replay(specs),), chunk_specs),
         train_chunk=split(program.train_chunk, (specs,), chunk_specs, donate=True),
         evaluate=lambda policy, env_steps: evaluate_all(policy, seeds, env_steps),
         num_drawable=split(num_drawable, (specs.buffer,), _MEMBER),
@@ -309,6 +318,12 @@ def _batched(
         return jax.tree.map(with_axis, out_specs, result)
 
     return alone
+
+
+def without_replay(state: TrainState) -> TrainState:
+    """A state, or a tree like it, without replay, environments and contexts."""
+    nothing: Any = None
+    return dataclasses.replace(state, env=nothing, context=nothing, buffer=nothing)
 
 
 def member_metrics(metrics: Metrics, index: int) -> Metrics:

@@ -138,18 +138,24 @@ def resume(
             return _start(population, folder, quiet)
         with Reporter(quiet or not is_first()) as reporter:
             restored = folder.restore(
-                population.abstract(), population.block_axes, population.shardings
+                population.stored(population.abstract()),
+                population.stored(population.block_axes),
+                population.stored(population.shardings),
             )
             for damaged in restored.moved_aside:
                 reporter.say(f"note: {damaged}")
-            reporter.facts(population, restored.state, folder.path)
+            state = restored.state
+            if not config.run.checkpoint_replay:
+                with reporter.timed("no replay was saved: collecting one under the policy"):
+                    state, _ = jax.block_until_ready(population.refill(state))
+            reporter.facts(population, state, folder.path)
             reporter.say(f"resuming at  {restored.progress.env_steps:,} env steps")
             if restored.host_threads != usable_cores():
                 reporter.say(
                     f"note: saved with {restored.host_threads} CPU threads, continued with "
                     f"{usable_cores()}: right, but not bit for bit the same"
                 )
-            return _train_on(population, folder, reporter, restored.state, restored.progress)
+            return _train_on(population, folder, reporter, state, restored.progress)
 
     return _alone_in(folder, go_on)
 

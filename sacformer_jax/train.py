@@ -53,6 +53,8 @@ class Program:
       buffer: the replay's functions.
       init: ``(key, hyper) -> TrainState``; without ``hyper`` it is :func:`hyperparameters`.
       prefill: ``TrainState -> (TrainState, metrics)``, random actions; the argument is donated.
+      refill: the same as ``prefill`` from fresh episodes, under the policy, whatever the state's
+        environments and replay were (None perhaps); the argument is not donated.
       train_chunk: ``TrainState -> (TrainState, metrics)``, one chunk; the argument is donated.
       update: ``(buffer state, hyper, learner, key) -> (learner, metrics)``, one gradient update on
         a batch from the replay; part of ``train_chunk``, not jitted by itself.
@@ -64,6 +66,7 @@ class Program:
     buffer: TrajectoryBuffer
     init: jax.stages.Wrapped
     prefill: jax.stages.Wrapped
+    refill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
     update: UpdateFromReplay
 
@@ -115,6 +118,7 @@ def make_program(
         buffer=buffer,
         init=jax.jit(functions.init),
         prefill=jax.jit(functions.prefill, donate_argnums=0),
+        refill=jax.jit(functions.refill),
         train_chunk=jax.jit(functions.train_chunk, donate_argnums=0),
         update=functions.update,
     )
@@ -168,8 +172,7 @@ class _TrainingFunctions:
         if hyper is None:
             hyper = hyperparameters(self.config, self.env.spec.action_size)
         key, learner_key, env_key = jax.random.split(key, 3)
-        cache = self.agent.init_cache(self.env.num_envs)
-        start = rollout.start(self.env, self.buffer, cache, env_key)
+        start = self._start(env_key)
         zero = jnp.zeros((), jnp.int32)
         learner = self.agent.init(learner_key)
         return TrainState(
@@ -181,6 +184,23 @@ class _TrainingFunctions:
             counters=Counters(zero, zero, zero, jnp.int32(NO_FAULT), zero, zero),
             key=key,
         )
+
+    def _start(self, key: jax.Array) -> RolloutState:
+        cache = self.agent.init_cache(self.env.num_envs)
+        return rollout.start(self.env, self.buffer, cache, key)
+
+    def refill(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        key, env_key = jax.random.split(state.key)
+        start, policy = self._start(env_key), policy_of(state)
+        state = dataclasses.replace(
+            state, env=start.env, context=start.context, buffer=start.buffer, key=key
+        )
+
+        def choose_action(context: Context, key: jax.Array) -> Acted:
+            return self.agent.act(policy, context, key, explore=True)
+
+        state, stats = self._collect(state, choose_action, self.config.prefill_vector_steps)
+        return state, _episode_metrics(stats)
 
     def prefill(self, state: TrainState) -> tuple[TrainState, Metrics]:
         def random_action(context: Context, key: jax.Array) -> Acted:

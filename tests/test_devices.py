@@ -170,7 +170,9 @@ def test_two_processes_train_one_run_and_one_continues_it(straight: Path, tmp_pa
     np.testing.assert_allclose(_losses(path), _losses(straight), rtol=1e-3)
 
 
-def test_two_processes_continue_what_one_began(straight: Path, stopped: Path, tmp_path: Path) -> None:
+def test_two_processes_continue_what_one_began(
+    straight: Path, stopped: Path, tmp_path: Path
+) -> None:
     path = _copy(stopped, tmp_path / "run")
     _two_processes("resume", path, "--total-env-steps", TOTAL)
     np.testing.assert_allclose(_losses(path), _losses(straight), rtol=1e-3)

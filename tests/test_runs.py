@@ -171,6 +171,31 @@ def test_a_run_killed_before_its_first_checkpoint_starts_from_the_beginning(
     ).read_bytes()
 
 
+def test_checkpoints_without_the_replay_are_small_and_collect_it_anew(
+    straight: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {**TINY, "checkpoint_replay": False, "total_env_steps": 400}
+    path = train(Config.from_preset("cpu", **settings, run_dir=str(tmp_path / "run"))).path
+    parts = []
+    for run in (straight.result.path, path):
+        metadata = json.loads((run / "checkpoints" / "400" / "metadata" / "metadata").read_text())
+        parts.append({name.split(".")[1] for name in metadata["items"]["state"]})
+    assert parts[0] - parts[1] == {"buffer", "env", "context"}
+    before = load_policy(path, "latest").state
+    result = resume(path, total_env_steps=800)
+    assert "no replay was saved: collecting one under the policy" in capsys.readouterr().out
+    # 200 steps to fill the replay again, without an update; then as ever.
+    counts = [(r["env_steps"], r["updates"]) for r in read_records(path / "metrics.jsonl", "train")]
+    assert counts == [(300, 100), (400, 200), (700, 300), (800, 400)]
+    assert result.env_steps == 800
+    assert digest(load_policy(path, "latest").state) != digest(before)
+    config = json.loads((path / "config.json").read_text())
+    config["config"]["run"]["checkpoint_replay"] = True
+    (path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match=r"checkpoint_replay=False, config.json says"):
+        resume(path, total_env_steps=1000)
+
+
 def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed: Outcome) -> None:
     assert resumed.result.evaluations == straight.result.evaluations
     assert not resumed.result.interrupted
