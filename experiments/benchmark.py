@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
-from bench import compiling, environments, peers, scaling, training, update
+from bench import checkpointing, compiling, environments, peers, scaling, training, update
 from bench.clock import Clock
 
 from sacformer_jax.cores import usable_cores
@@ -32,6 +32,7 @@ PARTS: dict[str, Measure] = {
     "train": training.measure,
     "peer": peers.measure,
     "scaling": scaling.measure,
+    "checkpoint": checkpointing.measure,
     "compile": compiling.measure,
 }
 """In the order they run: first the pieces, then the whole of them, then how it grows."""

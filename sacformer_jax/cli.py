@@ -79,9 +79,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args[0] not in by_name:
         return _refused(f"command {args[0]!r} does not exist; there are {', '.join(by_name)}")
+    return exit_code(lambda: by_name[args[0]](args[1:]))
+
+
+def exit_code(command: Callable[[], int]) -> int:
+    """Runs a command with the compilation cache; errors are told in a line and become codes."""
     compilation_cache.enable()
     try:
-        return by_name[args[0]](args[1:])
+        return command()
     except (ConfigError, CheckpointError) as error:
         return _refused(str(error))
     except DivergedError as fault:
@@ -100,7 +105,7 @@ def _refused(message: str) -> int:
     return EXIT_BAD_INPUT
 
 
-def _parse_config(args: list[str], prog: str) -> tuple[Resolved, Launch]:
+def parse_config(args: list[str], prog: str) -> tuple[Resolved, Launch]:
     """Reads flags over the preset's values for the agent and environment they name."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     # A flag without its value is left for the real parser to refuse.
@@ -125,7 +130,7 @@ def _parse_config(args: list[str], prog: str) -> tuple[Resolved, Launch]:
 def _train(args: list[str]) -> int:
     from sacformer_jax.runner import train
 
-    resolved, launch = _parse_config(args, "sacformer train")
+    resolved, launch = parse_config(args, "sacformer train")
     resolved.config.validated()
     launch.join()
     devices = launch.devices(len(resolved.config.all_seeds))
@@ -148,7 +153,7 @@ def _describe(args: list[str]) -> int:
     if args and not args[0].startswith("-"):
         return commands.describe_run(args)
     as_json = "--json" in args
-    resolved, _ = _parse_config([a for a in args if a != "--json"], "sacformer describe")
+    resolved, _ = parse_config([a for a in args if a != "--json"], "sacformer describe")
     resolved.config.validated()
     if as_json:
         print(json.dumps({"config": resolved.config.to_dict(), "sources": resolved.sources}))

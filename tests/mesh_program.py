@@ -19,10 +19,12 @@ from sacformer_jax.train import hyperparameters
 SETTINGS = {
     "env": "Hopper", "num_envs": 4, "max_episode_steps": 60, "prefill_env_steps": 480,
     "chunk_env_steps": 40, "total_env_steps": 2_000, "eval_episodes": 2, "actor_width": 8,
-    "actor_heads": 1, "actor_layers": 1, "critic_width": 8, "batch_size": 8,
-    "buffer_capacity": 2_000, "updates_per_env_step": 0.5, "normalize_obs": True,
-    "return_conditioning": "commanded", "tune_alpha": True, "target_return": "auto",
-    "actor_dropout": 0.0, "context_length": 3,
+    "actor_layers": 1, "critic_width": 8, "batch_size": 8, "buffer_capacity": 2_000,
+    "updates_per_env_step": 0.5, "normalize_obs": True, "tune_alpha": True,
+}  # fmt: skip
+SACFORMER = {
+    "actor_heads": 1, "actor_dropout": 0.0, "return_conditioning": "commanded",
+    "target_return": "auto", "context_length": 3,
 }  # fmt: skip
 COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 
@@ -34,9 +36,9 @@ def collectives(compiled: Any) -> dict[str, int]:
     return {name: number for name, number in found.items() if number}
 
 
-def trained(devices: Devices, num_seeds: int) -> dict[str, Any]:
-    """The states of a population after prefill and after two chunks, on these devices."""
-    config = Config.from_preset("cpu", **SETTINGS, seeds=num_seeds)
+def trained(devices: Devices) -> dict[str, Any]:
+    """The states of four seeds of SAC after prefill and after two chunks, on these devices."""
+    config = Config.from_preset("cpu", agent="sac", **SETTINGS, seeds=4)
     population = make_population(config, seed_members(config.all_seeds), devices)
     state, _ = population.prefill(population.init())
     prefilled = jax.tree.map(jnp.copy, state)
@@ -84,11 +86,8 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 
 def update_of_the_same_batch(agent_name: str) -> float:
     """Largest difference of the new learner: the batch on 4 devices, and on one."""
-    fields = dict(SETTINGS)
-    if agent_name == "sac":
-        for name in ("return_conditioning", "target_return", "context_length"):
-            fields.pop(name)
-    config = Config.from_preset("cpu", agent=agent_name, **fields)
+    own = SACFORMER if agent_name == "sacformer" else {}
+    config = Config.from_preset("cpu", agent=agent_name, **SETTINGS, **own)
     population = make_population(config, seed_members([0]))
     program, key = population.program, jax.random.key(3)
     state, _ = population.prefill(population.init())
@@ -122,11 +121,11 @@ def update_of_the_same_batch(agent_name: str) -> float:
 
 def main() -> None:
     assert jax.device_count() == 8
-    one, alone = trained(Devices(), 4), trained(Devices(), 1)
+    one = trained(Devices())
     found = {
-        "members": compared(one, trained(Devices(members=4), 4)),
-        "data": compared(alone, trained(Devices(data=4), 1)),
-        "both": compared(one, trained(Devices(members=4, data=2), 4)),
+        "members": compared(one, trained(Devices(members=4))),
+        "data": compared(one, trained(Devices(data=4))),
+        "both": compared(one, trained(Devices(members=4, data=2))),
         "update": {name: update_of_the_same_batch(name) for name in ("sacformer", "sac")},
     }
     print(json.dumps(found))

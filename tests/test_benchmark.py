@@ -6,9 +6,17 @@ import benchmark
 import jax
 import jax.numpy as jnp
 import pytest
-from bench import scaling
+from bench import checkpointing, scaling
+from bench.clock import Clock
 
+from sacformer_jax import Config
 from sacformer_jax.buffer import TrajectoryBuffer
+
+TINY = {
+    "env": "Hopper", "num_envs": 2, "max_episode_steps": 50, "prefill_env_steps": 200,
+    "chunk_env_steps": 20, "actor_width": 8, "actor_heads": 1, "actor_layers": 1,
+    "critic_width": 8, "batch_size": 4, "buffer_capacity": 20_000,
+}  # fmt: skip
 
 
 def small(clock):
@@ -82,6 +90,29 @@ def test_bytes_of_a_small_replay():
     beside, once = 4 + 4 + 1, 4 + 4 + 2 * 4
     expected = 2 * 50 * (scaling.transition_bytes(3, 1) + beside) + once
     assert scaling.num_bytes(state) == expected
+
+
+def test_seeds_are_trained_in_one_program():
+    config = Config.from_preset("cpu", **TINY)
+    results = scaling.by_seeds(Clock(), config, sizes=(1, 2))
+    assert results["scaling.seeds.1.over_one"] == 1
+    over_one = results["scaling.seeds.2.ms"] / results["scaling.seeds.1.ms"]
+    assert results["scaling.seeds.2.over_one"] == over_one > 0
+    # All but what the members have in common, three numbers, is there twice.
+    one, two = (results[f"scaling.seeds.{size}.state_bytes"] for size in (1, 2))
+    assert two == 2 * one - 3 * 4
+    assert results["scaling.seeds.2.temp_bytes"] > 0
+
+
+def test_checkpoints_are_timed_beside_training(tmp_path):
+    """The frame alone: how long a tiny one takes says nothing."""
+    results = checkpointing.measure_in(tmp_path / "run", Config.from_preset("cpu", **TINY), turns=2)
+    assert results["checkpoint.disk_bytes"] > 0.5 * results["checkpoint.state_bytes"] > 0
+    for what in ("blocking_ms", "written_beside_training_s", "written_alone_s", "restore_s"):
+        assert results[f"checkpoint.{what}"] > 0
+    assert results["checkpoint.extra_lowest_ms"] <= results["checkpoint.extra_highest_ms"]
+    share = results["checkpoint.extra_ms"] / 1e3 / 300
+    assert results["checkpoint.share_of_5_minutes"] == pytest.approx(share)
 
 
 def test_peak_memory_grows_with_what_is_held():

@@ -10,17 +10,16 @@ import dataclasses
 import json
 import resource
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from bench.child import answer_of
 from bench.clock import Clock
 from bench.update import UPDATES, full_buffer, updater
-from sacformer_jax import Config, make_program
+from sacformer_jax import Config, make_population, make_program, seed_members
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.train import hyperparameters
 from sacformer_jax.types import TrainState
@@ -35,6 +34,9 @@ SIZES: dict[str, tuple[str, tuple[int, ...]]] = {
 ENVS = (1, 8, 64)
 SEEDS = (1, 2, 4, 8)
 REPETITIONS = 3
+"""Of updates."""
+CHUNK_REPETITIONS = 9
+"""Of chunks, which are short."""
 ITERATIONS = 25
 """Of one chunk: in each, all environments step once and one update is made."""
 TRAINING = {"preset": "paper", "prefill_env_steps": 1_000, "chunk_env_steps": 10}
@@ -61,41 +63,70 @@ def updates(config: Config) -> Run:
     return updater(program, dataclasses.replace(state, buffer=full_buffer(program, state)))
 
 
-def iterations(num_envs: int, num_seeds: int = 1) -> Run:
-    """Runs ``ITERATIONS`` of training of all seeds, vmapped where there are several."""
-    config = config_of(
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """A population that trains.
+
+    Attributes:
+      run: runs a chunk of all members.
+      state_bytes: of the state of all members.
+      temp_bytes: what the compiled chunk takes besides, as XLA counts it.
+    """
+
+    run: Run
+    state_bytes: int
+    temp_bytes: int
+
+
+def chunk_config(num_envs: int) -> Config:
+    """Preset `cpu`, with ``ITERATIONS`` of a step of all environments and an update in a chunk."""
+    return config_of(
         preset="cpu",
         num_envs=num_envs,
         updates_per_env_step=1 / num_envs,
         prefill_env_steps=100 * num_envs,
         chunk_env_steps=ITERATIONS * num_envs,
     )
-    program = make_program(config)
-    state, _ = program.prefill(program.init(jax.random.key(0)))
-    chunk: Callable[[TrainState], Any] = program.train_chunk
-    if num_seeds > 1:
-        chunk = jax.jit(jax.vmap(program.train_chunk), donate_argnums=0)
-        keys = jax.random.split(state.key, num_seeds)
-        state = jax.tree.map(lambda leaf: jnp.stack([leaf] * num_seeds), state)
-        state = dataclasses.replace(state, key=keys)
+
+
+def training_of(config: Config, num_seeds: int = 1) -> Training:
+    """So many seeds, trained as ``sacformer train --seeds`` does, after their prefill."""
+    population = make_population(config, seed_members(range(num_seeds)))
+    state, _ = population.prefill(population.init())
+    train_chunk = population.train_chunk.lower(state).compile()
+    analysis: Any = train_chunk.memory_analysis()
 
     def again() -> Any:
         nonlocal state
-        state, metrics = chunk(state)
+        state, metrics = train_chunk(state)
         return metrics
 
-    return again
+    return Training(again, num_bytes(state), analysis.temp_size_in_bytes)
 
 
-def in_turns(clock: Clock, runs: Mapping[str, Run], per: int) -> dict[str, float]:
+def in_turns(clock: Clock, runs: Mapping[str, Run], per: int, repetitions: int) -> dict[str, float]:
     """Median times of all, in milliseconds and in GEMM units, by ``NAME.ms`` and so on.
 
     They take turns, so that the noise of a shared machine hits all sizes alike.
     """
     results: dict[str, float] = {}
-    for name, milliseconds in clock.side_by_side(runs, per, REPETITIONS).items():
+    for name, milliseconds in clock.side_by_side(runs, per, repetitions).items():
         results[f"{name}.ms"] = milliseconds
         results[f"{name}.gemm_units"] = milliseconds / clock.gemm_ms
+    return results
+
+
+def by_seeds(clock: Clock, config: Config, sizes: Sequence[int] = SEEDS) -> dict[str, float]:
+    """Iterations of so many seeds in one program, 1 among them; keys as in :func:`measure`."""
+    found = {f"scaling.seeds.{size}": training_of(config, size) for size in sizes}
+    runs = {name: each.run for name, each in found.items()}
+    results = in_turns(clock, runs, ITERATIONS, CHUNK_REPETITIONS)
+    for name, each in found.items():
+        results[f"{name}.state_bytes"] = float(each.state_bytes)
+        results[f"{name}.temp_bytes"] = float(each.temp_bytes)
+    for size in sizes:
+        ratio = results[f"scaling.seeds.{size}.ms"] / results["scaling.seeds.1.ms"]
+        results[f"scaling.seeds.{size}.over_one"] = ratio
     return results
 
 
@@ -139,7 +170,9 @@ def measure(clock: Clock) -> dict[str, float]:
 
     Times are those of an update for ``batch``, ``context`` (K), ``width`` (of the actor) and
     ``capacity`` (of the replay; ``scaling.capacity.growth`` is the largest over the smallest), and
-    those of an iteration, a step of all environments and an update, for ``envs`` and ``seeds``.
+    those of an iteration, a step of all environments and an update, for ``envs`` and ``seeds``
+    (all of them together). Of ``seeds`` also ``.over_one``, the time over that of one seed,
+    ``.state_bytes``, replays included, and ``.temp_bytes`` of the compiled chunk.
     """
     results: dict[str, float] = {}
     made: dict[Config, Run] = {}  # every row has the paper's own size
@@ -151,16 +184,14 @@ def measure(clock: Clock) -> dict[str, float]:
             config = config_of(preset="paper", acting_context="window", **{field: size})
             made[config] = made.get(config) or updates(config)
             runs[f"scaling.{what}.{size}"] = made[config]
-        results |= in_turns(clock, runs, UPDATES)
+        results |= in_turns(clock, runs, UPDATES, REPETITIONS)
     made.clear()  # their replays
     smallest, *_, largest = (f"scaling.capacity.{size}.ms" for size in SIZES["capacity"][1])
     results["scaling.capacity.growth"] = results[largest] / results[smallest]
     print("chunks by environments and by seeds …", file=sys.stderr, flush=True)
-    single = iterations(1)
-    runs = {f"scaling.envs.{size}": iterations(size) if size > 1 else single for size in ENVS}
-    results |= in_turns(clock, runs, ITERATIONS)
-    runs = {f"scaling.seeds.{size}": iterations(1, size) if size > 1 else single for size in SEEDS}
-    results |= in_turns(clock, runs, ITERATIONS)
+    runs = {f"scaling.envs.{size}": training_of(chunk_config(size)).run for size in ENVS}
+    results |= in_turns(clock, runs, ITERATIONS, CHUNK_REPETITIONS)
+    results |= by_seeds(clock, chunk_config(1))
     print("memory …", file=sys.stderr, flush=True)
     return results | memory()
 
