@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from types import TracebackType
@@ -45,8 +46,6 @@ Tree = TypeVar("Tree")
 KEEP = 2
 """Newest full checkpoints kept, so that a damaged one leaves another."""
 
-logging.getLogger("absl").setLevel(logging.CRITICAL)  # its errors are raised as well
-
 
 class CheckpointWriter:
     """Writes the checkpoints of a run in the background, one at a time.
@@ -65,6 +64,7 @@ class CheckpointWriter:
         self._folder, self._config, self._block_axes = folder, config, block_axes
         self._manager: ocp.CheckpointManager | None = None
         self._writing: int | None = None
+        self._silence = contextlib.ExitStack()
 
     def __enter__(self) -> CheckpointWriter:
         return self
@@ -83,6 +83,7 @@ class CheckpointWriter:
             error.add_note(str(failure))  # that one came first
         finally:
             self._close()
+            self._silence.close()
 
     def save(self, state: TrainState, policy: PolicyState, progress: Progress) -> None:
         """Saves a checkpoint under ``progress.env_steps``, where there is none yet.
@@ -116,9 +117,11 @@ class CheckpointWriter:
             }
         )
         self._writing = step
+        self._silence.enter_context(stored.Silence())  # what fails may do so at any time from now
         try:
             if self._manager is None:
                 self._manager = self._opened()
+            self._check_writable()
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
@@ -146,6 +149,7 @@ class CheckpointWriter:
         except Exception as error:
             raise self._failed(error) from error
         self._writing = None
+        self._silence.close()
         self._prune()
 
     def _opened(self) -> ocp.CheckpointManager:
@@ -157,6 +161,19 @@ class CheckpointWriter:
         return ocp.CheckpointManager(
             path, options=ocp.CheckpointManagerOptions(max_to_keep=KEEP, create=False)
         )
+
+    def _check_writable(self) -> None:
+        """Raises on all processes where no folder can be made: Orbax's would wait for it."""
+        problem: OSError | None = None
+        probe = self._folder.checkpoints_path / f"probe{stored.UNFINISHED}"
+        try:
+            if processes.is_first():
+                probe.mkdir(exist_ok=True)
+                probe.rmdir()
+        except OSError as error:
+            problem = error
+        if processes.any_process(problem is not None):
+            raise problem or OSError("the first process cannot write")
 
     def _close(self) -> None:
         """Lets go of the manager; after a failure it knows no longer what is on disk."""
@@ -171,7 +188,8 @@ class CheckpointWriter:
         step = self._writing
         self._close()
         if processes.is_first():
-            stored.remove_failed(self._folder.checkpoints_path)  # frees the disk
+            stored.remove_failed(self._folder.checkpoints_path, saving=True)  # frees the disk
+        self._silence.__exit__(type(error), error, error.__traceback__)
         return CheckpointError(
             f"checkpoint {self._folder.checkpoints_path / str(step)} could not be saved "
             f"({stored.one_line(error)}); the ones before it are as they were"

@@ -1,25 +1,34 @@
 """One checkpoint on disk: what its metadata says, and reading its arrays so that no damage passes.
 
 A checkpoint is a folder with arrays (Orbax) and ``metadata``, JSON that tells each leaf's type,
-shape and digest, and ends with a digest of its own: what the metadata says can be believed, or
-it is damaged.
+shape and digest, and has a digest of its own: it can be believed, or it is damaged.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import dataclasses
+import gc
 import hashlib
+import inspect
 import json
+import logging
 import os
 import re
 import shutil
+import sys
 import threading
 import time
+import traceback
+import warnings
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+import tensorstore
 
 from sacformer_jax import processes
 from sacformer_jax.digests import leaf_digests
@@ -29,6 +38,8 @@ FORMAT = 2
 """Version of a run folder's layout; raised when an older program could not read it."""
 UNFINISHED = ".orbax-checkpoint-tmp"
 """Ending of the names of folders that are being written."""
+
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax's errors are raised as well
 
 
 class CheckpointError(Exception):
@@ -86,19 +97,113 @@ def remove_unfinished(folder: Path) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def remove_failed(folder: Path) -> None:
+def remove_failed(folder: Path, saving: bool = False) -> None:
     """:func:`remove_unfinished` after a save that failed.
 
     Orbax raises the first error while other parts are still being written; they would come back.
+
+    Args:
+      folder: where it was saved.
+      saving: it was a checkpoint in the background, and not something beside one.
     """
+    until = time.monotonic() + 60.0
     for thread in threading.enumerate():
-        if type(thread).__module__.startswith("orbax."):
-            threading.Thread.join(thread, timeout=60.0)
+        of_orbax = type(thread).__module__.startswith("orbax.")
+        if of_orbax and (saving or not getattr(thread, "_receive_signals", None)):
+            _end(thread)
+            threading.Thread.join(thread, timeout=max(0.0, until - time.monotonic()))
     for _ in range(100):  # TensorStore's own threads have no handle
         remove_unfinished(folder)
         time.sleep(0.05)
         if not any(folder.glob(f"*{UNFINISHED}*")):
             break
+
+
+def _end(thread: Any) -> None:
+    """Ends a thread of Orbax, which may wait 20 minutes for a folder that could not be made."""
+    if jax.process_count() > 1:
+        return  # the others would be told that it was made
+    # Orbax has no other way; where it does this one otherwise, the thread is waited for.
+    with contextlib.suppress(AttributeError, KeyError, RuntimeError, TypeError):
+        thread.cancel()
+        tell = vars(sys.modules[type(thread).__module__])["set_signals"]
+        tell(thread._receive_signals, operation_id=thread._operation_id)
+
+
+_ORBAX = f"{os.sep}orbax{os.sep}"
+"""In the paths of Orbax's modules."""
+
+
+class Silence:
+    """Drops what the abandoned tasks of a failed read or write print; a context manager.
+
+    At the first error Orbax closes its event loop, while other reads or writes are under way. Each
+    of them complains then, when TensorStore is done with it or when its coroutine is collected.
+    Everything else is passed on. Leaving with an error waits until nothing can complain any more.
+    """
+
+    def __enter__(self) -> Silence:
+        self._others = sys.unraisablehook
+        sys.unraisablehook = self._hook
+        logging.getLogger("asyncio").addFilter(_not_of_orbax)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        _: TracebackType | None,
+    ) -> None:
+        if isinstance(error, Exception):
+            _settle(error)
+        logging.getLogger("asyncio").removeFilter(_not_of_orbax)
+        sys.unraisablehook = self._others
+
+    def _hook(self, raised: sys.UnraisableHookArgs) -> None:
+        if not _of_orbax(raised):
+            self._others(raised)
+
+
+def _of_orbax(raised: sys.UnraisableHookArgs) -> bool:
+    if inspect.iscoroutine(raised.object):
+        return _ORBAX in raised.object.cr_code.co_filename
+    # TensorStore's threads call this method, and no other Python around it.
+    first = raised.exc_traceback and raised.exc_traceback.tb_frame.f_code.co_name
+    return first == "call_soon_threadsafe" and str(raised.exc_value) == "Event loop is closed"
+
+
+def _not_of_orbax(record: logging.LogRecord) -> bool:
+    """Whether to pass on what asyncio logs: not of futures whose results nobody asked for."""
+    message = record.getMessage()
+    if "was never retrieved" not in message and "was destroyed but it is pending" not in message:
+        return True
+    error = record.exc_info[1] if record.exc_info else None
+    told = message + "".join(traceback.format_exception(error)) if error else message
+    # TensorStore's own errors have a status and no traceback.
+    status = error and not error.__traceback__ and re.match("[A-Z_]+: ", str(error))
+    return not (_ORBAX in told or status)
+
+
+def _settle(error: BaseException) -> None:
+    """Waits until what was begun beside a failed read or write is over, and collects its tasks."""
+    until = time.monotonic() + 20.0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+        link: BaseException | None = error
+        while link is not None:
+            traceback.clear_frames(link.__traceback__)  # they hold on to the tasks
+            link = link.__cause__ or link.__context__
+        gc.collect()
+        while any(_is_left(thing) for thing in gc.get_objects()) and time.monotonic() < until:
+            time.sleep(0.02)
+            gc.collect()
+
+
+def _is_left(thing: Any) -> bool:
+    """Whether it may still complain: TensorStore's futures live until they have called back."""
+    if type(thing) is asyncio.Task:
+        return not thing.done() and thing.get_loop().is_closed()
+    return type(thing) is tensorstore.Future
 
 
 # --- metadata ------------------------------------------------------------------------------------
@@ -145,9 +250,8 @@ def read_metadata(step_path: Path) -> dict[str, Any]:
         metadata = json.loads((step_path / "metadata" / "metadata").read_text())
         digest = metadata.pop("digest")
     except PermissionError as error:
-        raise CheckpointError(f"checkpoint {step_path} cannot be read ({one_line(error)})") from (
-            error
-        )
+        reason = one_line(error)
+        raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DamagedError("its metadata cannot be read") from error
     if _seal(metadata) != digest:
@@ -191,13 +295,13 @@ def read_item(
     # Every process reads for itself what it needs: one that fails must not leave others waiting.
     handler = ocp.StandardCheckpointHandler(multiprocessing_options=processes.alone())
     try:
-        return handler.restore(step_path / item, args=ocp.args.StandardRestore(target))
+        with Silence():
+            return handler.restore(step_path / item, args=ocp.args.StandardRestore(target))
     except Exception as error:  # Orbax raises many kinds for damaged files
-        reason = one_line(error)
-        not_the_files = isinstance(
-            error, (MemoryError, PermissionError, jax.errors.JaxRuntimeError)
-        )
-        if not_the_files or re.search("PERMISSION_DENIED|RESOURCE_EXHAUSTED", str(error)):
+        reason, cause = one_line(error), _root(error)
+        others = (MemoryError, PermissionError, jax.errors.JaxRuntimeError)
+        statuses = "PERMISSION_DENIED|RESOURCE_EXHAUSTED"
+        if isinstance(cause, others) or re.search(statuses, str(cause)):
             raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
         raise DamagedError(f"its {item} cannot be read: {reason}") from error
 
@@ -209,9 +313,8 @@ def check_digests(item: str, metadata: dict[str, Any], tree: Any) -> None:
       DamagedError: a leaf is not what was written.
     """
     table = metadata["items"][item]
-    structure = jax.tree.structure(tree)
     axes = [table[path]["block_axes"] for path in leaf_table(tree)]
-    digests = leaf_digests(tree, jax.tree.unflatten(structure, axes))
+    digests = leaf_digests(tree, jax.tree.unflatten(jax.tree.structure(tree), axes))
     for path, digest in digests.items():
         if digest != table[path]["digest"]:
             raise DamagedError(f"the digest of {item}{path} differs")
@@ -235,10 +338,16 @@ def _check_leaves(
 
 def one_line(error: BaseException) -> str:
     """What an error says, in one line that is not too long."""
+    error = _root(error)
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    text = str(error) or type(error).__name__
+    text = str(error)
     # TensorStore's messages go on for pages; what the system said is inside.
     if system := re.search(r"(?:OS error |os_error_code=')(\d+)", text):
         return os.strerror(int(system.group(1)))
-    return text.splitlines()[0][:200]
+    lines = re.split(r"[.\s]*See full TensorStore details", text)[0].strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__
+
+
+def _root(error: BaseException) -> BaseException:
+    return error if error.__cause__ is None else _root(error.__cause__)

@@ -204,17 +204,56 @@ def test_a_run_that_fails_is_told(
     assert "killed-1: not equal: killed-1: status 2: error: damaged" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("good", [True, False])
+@pytest.mark.parametrize("good", [(True, True), (True, False), (False, True)])
 def test_the_exit_code_and_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, good: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, good: tuple[bool, bool]
 ) -> None:
+    def kills(runs, kills, *_):
+        return {"n": kills, "good": good[0]}
+
+    def others(runs, names, _):
+        return {"names": names, "good": good[1]}
+
     monkeypatch.setattr(Runs, "finish", lambda runs, name: None)
     monkeypatch.setattr(Runs, "left", lambda runs, name: {})
-    monkeypatch.setattr(faults, "check_kills", lambda runs, kills, *_: {"n": kills, "good": good})
+    monkeypatch.setattr(faults, "check_kills", kills)
+    monkeypatch.setattr(faults, "check_faults", others)
     path = tmp_path / "results.json"
-    assert faults.main(["--kills", "7", "--seeds", "2", "--json", str(path)]) == (not good)
+    code = faults.main(["--kills", "7", "--seeds", "2", "--seed", "3", "--json", str(path)])
     results = json.loads(path.read_text())
-    assert (results["n"], results["settings"]["seeds"]) == (7, 2)
+    assert code == (good != (True, True))
+    assert results["good"] == (good == (True, True))
+    assert (results["n"], results["settings"]["seeds"], results["seed"]) == (7, 2, 3)
+    assert results["names"] == list(faults.FAULTS)
+    faults.main(["--only", "full-disk", "--json", str(path)])
+    results = json.loads(path.read_text())
+    assert results["names"] == ["full-disk"]
+    assert "n" not in results
+    faults.main(["--kills", "1", "--only", "--json", str(path)])
+    assert "names" not in json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(("resumed", "wrong"), [
+    ({"train state": "1"}, []), ({"train state": "2"}, ["train state differs"]),
+])  # fmt: skip
+def test_what_a_fault_left_is_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resumed: dict[str, str], wrong: list[str]
+) -> None:
+    def fault(runs, name):
+        (tmp_path / f"{name}.log").write_text("error: no space\nand so on\n")
+        return "what was done", []
+
+    runs = Runs(tmp_path, SHORT)
+    monkeypatch.setattr(runs, "finish", lambda name: None)
+    monkeypatch.setattr(runs, "left", lambda name: resumed)
+    monkeypatch.setitem(faults.HURTS, "full-disk", fault)
+    monkeypatch.setitem(faults.FAULTS, "full-disk", fault)
+    outcome = faults.hurt(runs, "full-disk", {"train state": "1"})
+    assert outcome == faults.Outcome("full-disk", "what was done", ["error: no space"], wrong)
+    with (tmp_path / "full-disk.log").open("a") as log:
+        log.write("Traceback (most recent call last):\n")
+    monkeypatch.setitem(faults.FAULTS, "full-disk", lambda runs, name: ("", []))
+    assert "it printed tracebacks" in faults.hurt(runs, "full-disk", resumed).wrong
 
 
 def test_runs_are_not_mixed_with_older_ones(

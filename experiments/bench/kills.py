@@ -69,15 +69,24 @@ class Runs:
             "PYTHONUNBUFFERED": "1",
         }
 
-    def start(self, name: str) -> Process:
-        """Trains the run, or resumes it where its folder holds one already."""
-        run = self.folder / name
+    def start(
+        self, name: str, place: Path | None = None, again: bool = False, **others: Any
+    ) -> Process:
+        """Trains the run, or resumes it where its folder holds one already.
+
+        Args:
+          name: of the run, and of its log.
+          place: its folder; default: by its name.
+          again: train it even where it can be resumed.
+          others: settings of a new run that are other ones than usual.
+        """
+        run = place or self.folder / name
         flags = [
             part
-            for key, value in self.settings.items()
+            for key, value in {**self.settings, **others}.items()
             for part in (f"--{key.replace('_', '-')}", str(value))
         ]
-        begun = (run / "config.json").is_file()
+        begun = (run / "config.json").is_file() and not again
         arguments = ["resume", str(run)] if begun else ["train", "--run-dir", str(run), *flags]
         log = self.folder / f"{name}.log"
         return Process(run, self.settings, arguments, self._environment, log)
