@@ -283,7 +283,13 @@ class _Splitter:
             batched = jax.shard_map(
                 batched, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
             )
-        return jax.jit(batched, donate_argnums=(0,) if donate else ())
+
+        def program(*arguments: Any) -> Any:
+            return batched(*arguments)
+
+        # What profiles and the compilation cache call it.
+        program.__name__ = function.__name__
+        return jax.jit(program, donate_argnums=(0,) if donate else ())
 
     def sharding(self, spec: Spec) -> jax.sharding.Sharding:
         if self.mesh is None:

@@ -186,21 +186,34 @@ def _not_of_orbax(record: logging.LogRecord) -> bool:
 
 def _settle(error: BaseException) -> None:
     """Waits until what was begun beside a failed read or write is over, and collects its tasks."""
-    until = time.monotonic() + 20.0
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
         link: BaseException | None = error
         while link is not None:
-            traceback.clear_frames(link.__traceback__)  # they hold on to the tasks
+            _clear(link)
             link = link.__cause__ or link.__context__
-        gc.collect()
-        while any(_is_left(thing) for thing in gc.get_objects()) and time.monotonic() < until:
-            time.sleep(0.02)
+        start = time.monotonic()
+        while True:
             gc.collect()
+            left = [thing for thing in gc.get_objects() if _may_complain(thing)]
+            busy = any(type(thing) is tensorstore.Future and not thing.done() for thing in left)
+            # Where an error in flight holds on to some, they are no longer waited for.
+            if not left or time.monotonic() - start > (20.0 if busy else 0.5):
+                break
+            del left
+            time.sleep(0.02)
 
 
-def _is_left(thing: Any) -> bool:
-    """Whether it may still complain: TensorStore's futures live until they have called back."""
+def _clear(error: BaseException) -> None:
+    """Lets go of what the frames of Orbax hold, which are over: its tasks."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if frame.f_globals.get("__name__", "").partition(".")[0] in ("orbax", "asyncio"):
+            with contextlib.suppress(RuntimeError):  # it is not over
+                frame.clear()
+
+
+def _may_complain(thing: Any) -> bool:
+    """Whether it is of what was abandoned: TensorStore's futures live until they called back."""
     if type(thing) is asyncio.Task:
         return not thing.done() and thing.get_loop().is_closed()
     return type(thing) is tensorstore.Future
