@@ -10,6 +10,8 @@ import json
 import logging
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -306,6 +308,47 @@ def test_memory_that_is_missing_is_no_damage(
     ):
         monkeypatch.setattr(ocp.StandardCheckpointHandler, "restore", failing(error))
         assert "cannot be read" in refusal_of(copy, abstract)
+
+
+# --- a folder in the way -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seen", ["before", "by Orbax"])
+def test_a_folder_that_can_no_longer_be_written(
+    copy: RunFolder,
+    program: Program,
+    states: dict[int, TrainState],
+    abstract: TrainState,
+    monkeypatch: pytest.MonkeyPatch,
+    seen: str,
+) -> None:
+    """Orbax's threads would wait 20 minutes for a folder that could not be made."""
+    if seen == "by Orbax":
+        monkeypatch.setattr(CheckpointWriter, "_check_writable", lambda writer: None)
+    path, aside = copy.path / "checkpoints", copy.path / "aside"
+    progress = dataclasses.replace(PROGRESS[OLD], env_steps=400)
+    with CheckpointWriter(copy, program.config) as writer:
+        writer.save(states[OLD], policy_of(states[OLD]), progress)
+        writer.wait()
+        path.rename(aside)
+        path.write_text("in the way")
+        start = time.monotonic()
+        progress = dataclasses.replace(progress, env_steps=500)
+
+        def save() -> None:
+            writer.save(states[NEW], policy_of(states[NEW]), progress)
+            writer.wait()
+
+        with pytest.raises(CheckpointError, match="500 could not be saved") as refused:
+            save()
+        assert time.monotonic() - start < 15
+        assert not [one for one in threading.enumerate() if "orbax" in type(one).__module__]
+        message_of(refused)
+        path.unlink()
+        aside.rename(path)
+        save()
+    assert checkpoint_names(copy) == ["400", "500"]
+    assert digest(copy.restore(abstract).state) == digest(states[NEW])
 
 
 # --- what is printed -----------------------------------------------------------------------------
