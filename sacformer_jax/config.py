@@ -13,7 +13,9 @@ from typing import Any, Literal
 
 from sacformer_jax.values import ConfigError, coerced, unknown
 
-AgentName = Literal["sacformer", "sac"]
+AgentName = Literal["sacformer", "sac", "td3", "ddpg", "ppo"]
+MLP_AGENTS = ("sac", "td3", "ddpg", "ppo")
+"""Agents that see one state."""
 PresetName = Literal["cpu", "paper", "authors"]
 Conditioning = Literal["hindsight", "commanded", "none"]
 EngineName = Literal["auto", "native", "mjx"]
@@ -135,7 +137,7 @@ class ActorConfig:
     actor_activation: Activation = "relu"
     """Activation function."""
     head_init_scale: float = 1.0
-    """Gain of the Xavier-uniform initialization of the mean and log-std heads."""
+    """Gain of the heads' initialization: Xavier-uniform, of ppo's mean orthogonal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,8 +181,8 @@ class PrecisionConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class SacConfig:
-    """The soft actor-critic update."""
+class LearningConfig:
+    """Step sizes, discount, soft updates, temperature."""
 
     actor_learning_rate: float = 3e-4
     """Adam step size of the actor."""
@@ -198,6 +200,48 @@ class SacConfig:
     """Adam step size of log alpha."""
     target_entropy: float | None = None
     """What tuning aims at, in nats; None: minus the number of action dimensions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Td3Config:
+    """What TD3 has beside DDPG (agent=td3)."""
+
+    policy_delay: int = 2
+    """Updates of the critics to one of the actor and of the targets."""
+    target_noise: float = 0.2
+    """Standard deviation of the noise on target actions, over half the action range."""
+    target_noise_clip: float = 0.5
+    """Largest absolute value of that noise, over half the action range."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PpoConfig:
+    """Proximal policy optimization (agent=ppo)."""
+
+    rollout_steps: int = 2048
+    """Steps of each environment between two rounds of learning."""
+    epochs: int = 10
+    """Passes over them in a round."""
+    minibatches: int = 32
+    """Parts of a pass, an update each."""
+    gae_lambda: float = 0.95
+    """λ of generalized advantage estimation."""
+    clip_range: float = 0.2
+    """How far the probability ratio may move from 1."""
+    clip_value_loss: bool = True
+    """Clip how far a value moves, too."""
+    entropy_coefficient: float = 0.0
+    """Weight of the entropy bonus."""
+    value_coefficient: float = 0.5
+    """Weight of the value loss."""
+    max_grad_norm: float = 0.5
+    """Norm that gradients are scaled down to."""
+    anneal_learning_rate: bool = True
+    """Let the learning rate fall to 0 linearly over the run."""
+    normalize_advantages: bool = True
+    """Mean 0 and standard deviation 1 in each part of a pass."""
+    normalize_reward: bool = True
+    """Divide rewards by the running standard deviation of discounted returns."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,7 +264,9 @@ class Config:
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     critic: CriticConfig = dataclasses.field(default_factory=CriticConfig)
     precision: PrecisionConfig = dataclasses.field(default_factory=PrecisionConfig)
-    sac: SacConfig = dataclasses.field(default_factory=SacConfig)
+    learning: LearningConfig = dataclasses.field(default_factory=LearningConfig)
+    td3: Td3Config = dataclasses.field(default_factory=Td3Config)
+    ppo: PpoConfig = dataclasses.field(default_factory=PpoConfig)
 
     @classmethod
     def from_preset(cls, preset: str = "cpu", **fields: Any) -> Config:
@@ -290,6 +336,8 @@ class Config:
     @property
     def steps_and_updates(self) -> tuple[int, int]:
         """Vector steps and gradient updates of one training iteration (their ratio is UTD)."""
+        if self.agent == "ppo":
+            return self.ppo.rollout_steps, self.ppo.epochs * self.ppo.minibatches
         ratio = Fraction(self.replay.updates_per_env_step).limit_denominator(1000)
         ratio *= self.task.num_envs
         return ratio.denominator, ratio.numerator

@@ -105,8 +105,11 @@ class Reporter:
             f"critics {_count(learner.critic_params)}"
         )
         cache = num_bytes(state.context.cache)
+        replay = "no replay"
+        if state.buffer is not None:
+            replay = f"replay {num_bytes(state.buffer) / 2**20:.1f} MiB"
         self.say(
-            f"memory       replay {num_bytes(state.buffer) / 2**20:.1f} MiB"
+            f"memory       {replay}"
             + (f", cache of acting {cache / 2**20:.1f} MiB" if cache else "")
         )
 

@@ -1,6 +1,6 @@
-"""Twin critics over windows: one signature for the MLP and the transformer.
+"""Critics over windows, twins or any number: one signature for the MLP and the transformer.
 
-Letters: B windows, K steps, T states (K or K+1), O, A, D width.
+Letters: C critics, B windows, K steps, T states (K or K+1), O, A, D width.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ class CriticInputs:
 
 
 Judge = Callable[[Params, CriticInputs, jax.Array], jax.Array]
-"""``(params, inputs, candidate [B, K, A]) -> Q [2, B, K]``."""
+"""``(params, inputs, candidate [B, K, A]) -> Q [C, B, K]``."""
 
 
 @dataclasses.dataclass(frozen=True)
-class TwinCritics:
-    """Two independent critics as pure functions.
+class Critics:
+    """C independent critics as pure functions.
 
     Attributes:
-      init: ``(key, inputs) -> params``, leaves ``[2, ...]``.
+      init: ``(key, inputs) -> params``, leaves ``[C, ...]``.
       now: judges candidates at the first K states.
       following: judges candidates at the last K states.
     """
@@ -66,8 +66,8 @@ class TwinCritics:
 
 
 def make_critics(
-    config: CriticConfig, dtype: str, context_length: int, max_time_step: int
-) -> TwinCritics:
+    config: CriticConfig, dtype: str, context_length: int, max_time_step: int, num: int = 2
+) -> Critics:
     """The critics that a configuration asks for.
 
     Args:
@@ -75,11 +75,17 @@ def make_critics(
       dtype: of the products.
       context_length: K; no candidate attends to more than K states.
       max_time_step: size of the transformer's time-step embedding.
+      num: C.
     """
     if config.critic == "mlp":
         widths = (config.critic_width,) * config.critic_layers
         return mlp_critics(
-            widths, config.critic_activation, config.critic_layer_norm, dtype, config.critic_init
+            widths,
+            config.critic_activation,
+            config.critic_layer_norm,
+            dtype,
+            config.critic_init,
+            num,
         )
     trunk = TransformerConfig(
         layers=config.critic_layers,
@@ -90,18 +96,18 @@ def make_critics(
         activation=config.critic_activation,
         dtype=dtype,
     )
-    return transformer_critics(trunk, context_length, max_time_step)
+    return transformer_critics(trunk, context_length, max_time_step, num)
 
 
-def twin(critic: type[nn.Module]) -> Callable[..., nn.Module]:
-    """Two independent copies; parameters and output lead with their axis."""
+def twin(critic: type[nn.Module], num: int = 2) -> Callable[..., nn.Module]:
+    """Independent copies, two or ``num``; parameters and output lead with their axis."""
     return nn.vmap(
         critic,
         variable_axes={"params": 0},
         split_rngs={"params": True},
         in_axes=None,
         out_axes=0,
-        axis_size=2,
+        axis_size=num,
     )
 
 
@@ -130,11 +136,12 @@ def mlp_critics(
     layer_norm: bool,
     dtype: str = "float32",
     kernel_init: str = "lecun",
-) -> TwinCritics:
+    num: int = 2,
+) -> Critics:
     """Critics that see the state and the action alone (the paper's)."""
-    critic = twin(MLPCritic)(tuple(widths), activation, layer_norm, dtype, kernel_init)
+    critic = twin(MLPCritic, num)(tuple(widths), activation, layer_norm, dtype, kernel_init)
     apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
-    return TwinCritics(
+    return Critics(
         init=lambda key, inputs: critic.init(key, inputs.obs, inputs.action),
         now=lambda params, inputs, candidate: apply(params, inputs.obs, candidate),
         following=lambda params, inputs, candidate: apply(params, inputs.next_obs, candidate),
@@ -212,10 +219,10 @@ def candidate_mask(state_mask: jax.Array, band: int) -> jax.Array:
 
 
 def transformer_critics(
-    config: TransformerConfig, context_length: int, max_time_step: int
-) -> TwinCritics:
+    config: TransformerConfig, context_length: int, max_time_step: int, num: int = 2
+) -> Critics:
     """Critics that see the window up to the action they judge."""
-    critic = twin(TransformerCritic)(config, context_length, max_time_step)
+    critic = twin(TransformerCritic, num)(config, context_length, max_time_step)
     apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
 
     def init(key: jax.Array, inputs: CriticInputs) -> Params:
@@ -248,6 +255,6 @@ def transformer_critics(
             inputs.time_step,
             inputs.state_mask,
         )
-        return q[..., 1:]  # [2, B, K]
+        return q[..., 1:]  # [C, B, K]
 
-    return TwinCritics(init, now, following)
+    return Critics(init, now, following)

@@ -8,7 +8,10 @@ two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``u
   ``episodes``, ``episode_return_mean``, ``episode_return_max``, ``episode_length_mean``,
   ``bad_physics`` (steps dropped), ``skipped_updates`` (those with a tensor that was not finite;
   they are in no mean), ``critic_loss``, ``actor_loss``, ``q_mean``, ``entropy`` (nats), ``alpha``,
-  ``actor_grad_norm``, ``critic_grad_norm``.
+  ``actor_grad_norm``, ``critic_grad_norm``. PPO has no ``q_mean`` and no ``alpha``, but
+  ``approx_kl`` (nats), ``clip_fraction``, ``explained_variance`` (of the value targets, before the
+  round's updates), ``learning_rate`` (the actor's); its losses are the clipped ones, without
+  coefficients, and its gradient norms those before scaling down.
 ``kind = "eval"``, one line an evaluation:
   ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import flax.linen as nn
@@ -26,6 +27,7 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 KERNEL_INITS = {
     "lecun": nn.initializers.lecun_uniform(),
     "xavier": nn.initializers.xavier_uniform(),
+    "orthogonal": nn.initializers.orthogonal(math.sqrt(2.0)),
 }
 
 
@@ -58,6 +60,11 @@ class ActorOutput:
     seen: Seen
 
 
+def head_init(scale: float) -> nn.initializers.Initializer:
+    """Xavier-uniform with a gain."""
+    return nn.initializers.variance_scaling(scale**2, "fan_avg", "uniform")
+
+
 class GaussianHeads(nn.Module):
     """Two linear heads; log-std clipped to [-20, 2].
 
@@ -71,7 +78,7 @@ class GaussianHeads(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> GaussianParams:
-        init = nn.initializers.variance_scaling(self.scale**2, "fan_avg", "uniform")
+        init = head_init(self.scale)
         mean = Dense(self.action_size, init, name="mean")(features)
         log_std = Dense(self.action_size, init, name="log_std")(features)
         return GaussianParams(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
@@ -255,3 +262,27 @@ class MLPActor(nn.Module):
         features = MLP(self.widths, self.activation, dtype=self.dtype, name="mlp")(obs)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(features), ())
+
+
+class DeterministicActor(nn.Module):
+    """TD3's and DDPG's actor: one action for a state, before tanh.
+
+    Attributes:
+      widths: of the hidden layers.
+      activation: one of :data:`~sacformer_jax.transformer.ACTIVATIONS`.
+      action_size: A.
+      head_init_scale: gain of the Xavier-uniform kernel of the last layer.
+      dtype: of the hidden layers' products.
+    """
+
+    widths: Sequence[int]
+    activation: str
+    action_size: int
+    head_init_scale: float
+    dtype: str = "float32"
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        """``obs [..., O]``, normalized -> ``[..., A]``."""
+        features = MLP(self.widths, self.activation, dtype=self.dtype, name="mlp")(obs)
+        return Dense(self.action_size, head_init(self.head_init_scale), name="action")(features)

@@ -59,10 +59,14 @@ class Devices:
         Raises:
           ConfigError: otherwise.
         """
+        batch, batch_size = "batch_size", config.replay.batch_size
+        if config.agent == "ppo":
+            batch = "num_envs * rollout_steps / minibatches"
+            batch_size = config.task.num_envs * config.ppo.rollout_steps // config.ppo.minibatches
         for name, size, what, split in (
             ("seed_devices", self.members, "members", num_members),
             ("data_devices", self.data, "num_envs", config.task.num_envs),
-            ("data_devices", self.data, "batch_size", config.replay.batch_size),
+            ("data_devices", self.data, batch, batch_size),
         ):
             if size < 1 or split % size:
                 raise ConfigError(f"{name}={size}: must be at least 1 and divide {what}={split}")
@@ -111,7 +115,7 @@ class Population:
       train_chunk: ``TrainState -> (TrainState, metrics [S])``; the argument is donated.
       evaluate: ``(policies [S, ...], env_steps) -> Evaluation [S, E]``, by the members' seeds.
       num_drawable: ``BufferState -> [S]``, see
-        :meth:`~sacformer_jax.buffer.TrajectoryBuffer.num_drawable`.
+        :meth:`~sacformer_jax.buffer.TrajectoryBuffer.num_drawable`; None without a replay.
     """
 
     program: Program
@@ -124,7 +128,7 @@ class Population:
     refill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
     evaluate: Callable[[PolicyState, Any], Evaluation]
-    num_drawable: jax.stages.Wrapped
+    num_drawable: jax.stages.Wrapped | None
 
     @property
     def config(self) -> Config:
@@ -217,7 +221,9 @@ def make_population(
         refill=split(program.refill, (without_replay(specs),), chunk_specs),
         train_chunk=split(program.train_chunk, (specs,), chunk_specs, donate=True),
         evaluate=lambda policy, env_steps: evaluate_all(policy, seeds, env_steps),
-        num_drawable=split(num_drawable, (specs.buffer,), _MEMBER),
+        num_drawable=None
+        if program.replay is None
+        else split(num_drawable, (specs.buffer,), _MEMBER),
     )
 
 
@@ -253,12 +259,15 @@ def _specs(init: Callable[..., TrainState], hyper: Hyperparameters, data: DataAx
         return jax.tree.map(lambda _: spec, tree)
 
     specs: Any = all_of(state, _MEMBER_AND_DATA)
+    buffer = specs.buffer
+    if buffer is not None:
+        buffer = dataclasses.replace(buffer, head=_COMMON, size=_COMMON)
     whole: TrainState = dataclasses.replace(
         specs,
         learner=all_of(state.learner, _MEMBER),
         hyper=all_of(state.hyper, _MEMBER),
         env=dataclasses.replace(specs.env, key=_MEMBER),
-        buffer=dataclasses.replace(specs.buffer, head=_COMMON, size=_COMMON),
+        buffer=buffer,
         counters=dataclasses.replace(all_of(state.counters, _MEMBER), env_steps=_COMMON),
         key=_MEMBER,
     )

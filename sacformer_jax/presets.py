@@ -58,6 +58,18 @@ _SAC_ACTOR = {
     "actor_dropout": 0.0,
 }
 
+_DETERMINISTIC = {**_SAC_ACTOR, "batch_size": 256, "prefill_env_steps": 25_000}
+_PPO = {
+    **_SAC_ACTOR,
+    "actor_width": 64,
+    "critic_width": 64,
+    "actor_activation": "tanh",
+    "critic_activation": "tanh",
+    "head_init_scale": 0.01,
+    "normalize_obs": True,
+    "prefill_env_steps": 0,
+}
+
 # The defaults of Config are the paper's settings; what it leaves open is set here.
 _PAPER = (
     *_TARGET_RETURNS,
@@ -68,6 +80,13 @@ _PAPER = (
         "SAC (arXiv 1812.05905): 2x256, batch 256, tuned temperature",
         {**_SAC_ACTOR, "batch_size": 256, "tune_alpha": True, "alpha": 1.0},
         agent="sac",
+    ),
+    Layer("TD3 (arXiv 1802.09477) as CleanRL runs it", _DETERMINISTIC, agent="td3"),
+    Layer("DDPG (arXiv 1509.02971) as CleanRL runs it", _DETERMINISTIC, agent="ddpg"),
+    Layer(
+        "PPO (arXiv 1707.06347) as CleanRL runs it",
+        {**_PPO, "chunk_env_steps": 2_048},
+        agent="ppo",
     ),
 )
 
@@ -135,6 +154,32 @@ PRESETS: dict[str, tuple[Layer, ...]] = {
             "preset cpu: SAC's own network and batch (arXiv 1812.05905)",
             {**_SAC_ACTOR, "actor_heads": 1, "batch_size": 256, "head_init_scale": 1.0},
             agent="sac",
+        ),
+        *(
+            Layer(
+                f"preset cpu: {agent.upper()}'s own network and batch, as CleanRL runs it",
+                {
+                    **_SAC_ACTOR,
+                    "actor_heads": 1,
+                    "batch_size": 256,
+                    "head_init_scale": 1.0,
+                    "tune_alpha": False,
+                },
+                agent=agent,
+            )
+            for agent in ("td3", "ddpg")
+        ),
+        Layer(
+            "preset cpu: PPO as CleanRL runs it, the steps of a round from 8 environments",
+            {
+                **_PPO,
+                "actor_heads": 1,
+                "critic_learning_rate": 3e-4,
+                "tune_alpha": False,
+                "rollout_steps": 256,
+                "chunk_env_steps": 2_048,
+            },
+            agent="ppo",
         ),
     ),
 }

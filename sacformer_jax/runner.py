@@ -161,12 +161,14 @@ def resume(
 
 
 def check_memory(population: Population) -> None:
-    """Refuses a replay that does not fit in a device.
+    """Refuses a replay, if there is one, that does not fit in a device.
 
     Raises:
       ConfigError: with the arithmetic.
     """
     state, devices = population.abstract(), population.devices
+    if state.buffer is None:
+        return
     # Learner and counters lie on every data device, but next to the replay they are nothing.
     num_devices = devices.members * devices.data
     device, on_cpu = jax.local_devices()[0], jax.default_backend() == "cpu"
@@ -195,15 +197,16 @@ def _start(population: Population, folder: RunFolder, quiet: bool) -> RunResult:
     with Reporter(quiet or not is_first()) as reporter:
         state = population.init()
         reporter.facts(population, state, folder.path)
-        with reporter.timed("compiling and running prefill"):
-            state, _ = jax.block_until_ready(population.prefill(state))
-        drawable = gathered(population.num_drawable(state.buffer))
-        if not np.all(drawable > 0):
-            raise ConfigError(
-                f"prefill_env_steps={config.run.prefill_env_steps}: no episode of at least "
-                f"context_length={config.context.context_length} steps finished in it; use more, "
-                "or a smaller context_length"
-            )
+        if population.num_drawable is not None:
+            with reporter.timed("compiling and running prefill"):
+                state, _ = jax.block_until_ready(population.prefill(state))
+            drawable = gathered(population.num_drawable(state.buffer))
+            if not np.all(drawable > 0):
+                raise ConfigError(
+                    f"prefill_env_steps={config.run.prefill_env_steps}: no episode of at least "
+                    f"context_length={config.context.context_length} steps finished in it; use "
+                    "more, or a smaller context_length"
+                )
         return _train_on(population, folder, reporter, state, None)
 
 

@@ -49,10 +49,12 @@ class Acted:
     Attributes:
       action: ``[N, A]``.
       context: the context it acted on, whose cache now holds that pair too.
+      sample: ``[N, A]`` what it drew, where it explored and the action is that clipped (PPO).
     """
 
     action: jax.Array
     context: Context
+    sample: jax.Array | None = None
 
 
 @flax.struct.dataclass
@@ -136,6 +138,34 @@ class Transition:
     bad: jax.Array
     time_step: jax.Array
     return_so_far: jax.Array
+
+
+@flax.struct.dataclass
+class Rollout:
+    """T steps in a row of N environments, for an agent without a replay. ``[T, N]`` leads.
+
+    Attributes:
+      obs: ``[T, N, O]`` raw observations acted on.
+      sample: ``[T, N, A]`` what the agent drew, before it was clipped to the bounds.
+      reward: ``[T, N]``.
+      terminated: bool ``[T, N]``.
+      truncated: bool ``[T, N]``.
+      bad: bool ``[T, N]`` bad physics: never to be learnt from.
+      next_obs: ``[T, N, O]`` raw observations after the step, before any reset.
+    """
+
+    obs: jax.Array
+    sample: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    bad: jax.Array
+    next_obs: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """The episode ended, whichever way: bool ``[T, N]``."""
+        return self.terminated | self.truncated
 
 
 @flax.struct.dataclass
@@ -244,16 +274,24 @@ class LearnerState:
       critic_opt: Adam state of the critics.
       alpha_opt: Adam state of log α.
       normalizer: observation statistics.
+      target_actor_params: slow copy of the actor (TD3, DDPG).
+      num_updates: int32 scalar, updates so far (TD3, PPO).
+      reward_scale: statistics of discounted returns, by whose spread rewards are divided (PPO).
+
+    What an agent has no use for is None.
     """
 
     actor_params: Params
     critic_params: Params
     target_critic_params: Params
-    log_alpha: jax.Array
+    log_alpha: jax.Array | None
     actor_opt: Any
     critic_opt: Any
     alpha_opt: Any
     normalizer: Normalizer
+    target_actor_params: Params = None
+    num_updates: jax.Array | None = None
+    reward_scale: Normalizer | None = None
 
 
 @flax.struct.dataclass
@@ -286,15 +324,17 @@ class TrainState:
       hyper: numeric hyperparameters.
       env: states of the N environments.
       context: the acting contexts.
-      buffer: the trajectory replay.
+      buffer: the trajectory replay; None for an agent that keeps none.
       counters: totals.
       key: typed PRNG key.
+      discounted_return: ``[N]`` of the running episodes so far (PPO); None for the others.
     """
 
     learner: LearnerState
     hyper: Hyperparameters
     env: VectorEnvState
     context: Context
-    buffer: BufferState
+    buffer: BufferState | None
     counters: Counters
     key: jax.Array
+    discounted_return: jax.Array | None = None

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from sacformer_jax.config import Config, ConfigError, shortest_column
+from sacformer_jax.config import MLP_AGENTS, Config, ConfigError, shortest_column
 
 _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width", "critic_heads",
+    "critic_width", "critic_heads", "policy_delay", "rollout_steps", "epochs", "minibatches",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
     "critic_learning_rate", "alpha", "alpha_learning_rate", "tau", "action_noise_clip",
+    "clip_range", "max_grad_norm", "target_noise_clip",
 )  # fmt: skip
-_AT_MOST_ONE = ("tau", "discount", "rtg_discount")
+_AT_MOST_ONE = ("tau", "discount", "rtg_discount", "gae_lambda")
 
 
 def _require(holds: bool, message: str) -> None:
@@ -43,7 +44,8 @@ def check(config: Config) -> None:
         _require(values[name] <= 1, f"{name}={values[name]}: must be at most 1")
     for name in (
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
-        "max_skipped_updates",
+        "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
+        "value_coefficient",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _check_seeds(config)
@@ -53,7 +55,10 @@ def check(config: Config) -> None:
     _check_target_return(config)
     _check_acting(config)
     _check_critic(config)
-    _check_steps(config)
+    if config.agent == "ppo":
+        _check_ppo(config)
+    else:
+        _check_steps(config)
 
 
 def _check_seeds(config: Config) -> None:
@@ -75,24 +80,24 @@ def _check_actor(config: Config) -> None:
         f"actor_dropout={actor.actor_dropout}: must be at least 0 and below 1",
     )
     _require(
-        not actor.acting_dropout or (config.agent != "sac" and actor.actor_dropout > 0),
+        not actor.acting_dropout or (config.agent not in MLP_AGENTS and actor.actor_dropout > 0),
         "acting_dropout=True: there is no dropout to leave on; use acting_dropout=False, or "
         "agent=sacformer with actor_dropout above 0",
     )
-    if config.agent == "sac":
+    if config.agent in MLP_AGENTS:
         _require(
             context.context_length == 1,
-            f"context_length={context.context_length}: agent=sac sees one state; "
+            f"context_length={context.context_length}: agent={config.agent} sees one state; "
             "use context_length=1, or agent=sacformer",
         )
         _require(
             context.return_conditioning == "none",
-            f"return_conditioning={context.return_conditioning!r}: agent=sac sees no return; "
-            "use return_conditioning=none, or agent=sacformer",
+            f"return_conditioning={context.return_conditioning!r}: agent={config.agent} sees no "
+            "return; use return_conditioning=none, or agent=sacformer",
         )
         _require(
             context.tokens == "gs",
-            f"tokens={context.tokens!r}: agent=sac sees no actions; use tokens=gs, "
+            f"tokens={context.tokens!r}: agent={config.agent} sees no actions; use tokens=gs, "
             "or agent=sacformer",
         )
     else:
@@ -109,7 +114,7 @@ def _check_actor(config: Config) -> None:
 
 def _check_policy(config: Config) -> None:
     _require(
-        config.policy.policy == "gaussian" or not config.sac.tune_alpha,
+        config.policy.policy == "gaussian" or not config.learning.tune_alpha,
         "tune_alpha=True: policy=deterministic has no entropy to tune it by; use "
         "tune_alpha=False, or policy=gaussian",
     )
@@ -136,8 +141,8 @@ def _check_window(config: Config) -> None:
         )
         return
     reasons = {
-        "agent=sac sees one state; use window=contiguous, or agent=sacformer": (
-            config.agent != "sac"
+        f"agent={config.agent} sees one state; use window=contiguous, or agent=sacformer": (
+            config.agent not in MLP_AGENTS
         ),
         "with tokens=gsa an action must stand before the state it led to; use tokens=gs": (
             context.tokens == "gs"
@@ -152,6 +157,41 @@ def _check_window(config: Config) -> None:
     }
     for reason, holds in reasons.items():
         _require(holds, f"window={context.window!r}: {reason}")
+
+
+def _check_ppo(config: Config) -> None:
+    ppo, run = config.ppo, config.run
+    batch = ppo.rollout_steps * config.task.num_envs
+    _require(
+        batch % ppo.minibatches == 0 and batch > ppo.minibatches,
+        f"minibatches={ppo.minibatches}: must divide rollout_steps={ppo.rollout_steps} times "
+        f"num_envs={config.task.num_envs}, and leave two steps or more in each",
+    )
+    _require(
+        run.prefill_env_steps == 0,
+        f"prefill_env_steps={run.prefill_env_steps}: agent=ppo learns from its own steps alone; "
+        "use prefill_env_steps=0",
+    )
+    _require(
+        run.checkpoint_replay,
+        "checkpoint_replay=False: agent=ppo keeps no replay that could be left out; use True",
+    )
+    _require(
+        run.total_env_steps < 2**31,
+        f"total_env_steps={run.total_env_steps}: must be below 2**31, the counters' range",
+    )
+    _require(
+        not config.learning.tune_alpha, "tune_alpha=True: agent=ppo has no temperature; use False"
+    )
+    _require(
+        config.policy.policy == "gaussian",
+        f"policy={config.policy.policy!r}: agent=ppo needs probabilities; use policy=gaussian",
+    )
+    _require(
+        config.critic.critic_init == "lecun",
+        f"critic_init={config.critic.critic_init!r}: agent=ppo initializes orthogonally; use "
+        "critic_init=lecun, the default",
+    )
 
 
 def _check_target_return(config: Config) -> None:
@@ -169,8 +209,8 @@ def _check_acting(config: Config) -> None:
     if context.acting_context == "window":
         return
     _require(
-        config.agent != "sac",
-        f"acting_context={context.acting_context!r}: agent=sac sees one state; use "
+        config.agent not in MLP_AGENTS,
+        f"acting_context={context.acting_context!r}: agent={config.agent} sees one state; use "
         "acting_context=window, or agent=sacformer",
     )
     _require(
@@ -191,8 +231,9 @@ def _check_critic(config: Config) -> None:
     if critic.critic == "mlp":
         return
     _require(
-        config.agent != "sac",
-        f"critic={critic.critic!r}: agent=sac sees one step; use critic=mlp, or agent=sacformer",
+        config.agent not in MLP_AGENTS,
+        f"critic={critic.critic!r}: agent={config.agent} sees one step; use critic=mlp, or "
+        "agent=sacformer",
     )
     _require(
         config.context.context_length > 1,

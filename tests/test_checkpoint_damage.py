@@ -271,7 +271,11 @@ def _set_config(folder: RunFolder, section: str, **fields: Any) -> None:
 
 @pytest.mark.parametrize(
     ("section", "field", "value", "was"),
-    [("sac", "tau", 0.5, "0.005"), ("actor", "actor_width", 16, "8"), ("", "seeds", 2, "(4, 9)")],
+    [
+        ("learning", "tau", 0.5, "0.005"),
+        ("actor", "actor_width", 16, "8"),
+        ("", "seeds", 2, "(4, 9)"),
+    ],
 )
 def test_a_changed_config_is_refused(
     copy: RunFolder, abstract: TrainState, section: str, field: str, value: Any, was: str

@@ -169,7 +169,7 @@ def test_describe_json(run) -> None:
     described = json.loads(said.out)
     config = Config.from_dict(described["config"])
     assert config == Config.from_preset("paper", env="Humanoid", seed=5)
-    assert (config.sac.alpha, config.context.context_length) == (0.05, 10)
+    assert (config.learning.alpha, config.context.context_length) == (0.05, 10)
     assert set(described["sources"]) == set(field_places())
     assert described["sources"]["seed"] == "command line"
     assert described["sources"]["alpha"] == "authors' program: alpha 0.05 on Humanoid"

@@ -56,7 +56,7 @@ def test_from_dict_refuses_unknown_and_mistyped_fields() -> None:
     with pytest.raises(ConfigError, match="num_envz"):
         Config.from_dict(values)
     values = Config().to_dict()
-    values["sac"]["tau"] = "small"
+    values["learning"]["tau"] = "small"
     with pytest.raises(ConfigError, match=r"tau='small'"):
         Config.from_dict(values)
 
@@ -90,7 +90,7 @@ def test_every_field_has_a_docstring() -> None:
 def test_replace_takes_bare_names_and_leaves_the_original() -> None:
     original = Config()
     changed = original.replace(env="Ant", tau=0.01, seed=3)
-    assert (changed.task.env, changed.sac.tau, changed.seed) == ("Ant", 0.01, 3)
+    assert (changed.task.env, changed.learning.tau, changed.seed) == ("Ant", 0.01, 3)
     assert original == Config()
     differing = {n for n, v in changed.flat().items() if v != original.flat()[n]}
     assert differing == {"env", "tau", "seed"}
@@ -98,12 +98,12 @@ def test_replace_takes_bare_names_and_leaves_the_original() -> None:
 
 def test_numbers_are_taken_where_nothing_is_lost() -> None:
     made = Config().replace(discount=1, num_envs=4.0, total_env_steps=1e6, target_entropy=-3)
-    assert made.sac.discount == 1.0
-    assert isinstance(made.sac.discount, float)
+    assert made.learning.discount == 1.0
+    assert isinstance(made.learning.discount, float)
     assert isinstance(made.task.num_envs, int)
     assert made.run.total_env_steps == 1_000_000
-    assert made.sac.target_entropy == -3.0
-    assert made.replace(target_entropy=None).sac.target_entropy is None
+    assert made.learning.target_entropy == -3.0
+    assert made.replace(target_entropy=None).learning.target_entropy is None
 
 
 # --- presets -----------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_sources_name_every_field(preset: str, agent: str) -> None:
     assert all(source.strip() for source in resolved.sources.values())
     given = {name for name, source in resolved.sources.items() if source == "from me"}
     assert given == {"agent", "env", "tau"}
-    assert resolved.config.sac.tau == 0.01
+    assert resolved.config.learning.tau == 0.01
 
 
 def test_a_preset_value_names_its_layer_as_source() -> None:
@@ -155,7 +155,7 @@ def test_preset_paper_holds_the_papers_values() -> None:
 
 def test_preset_paper_on_humanoid() -> None:
     made = Config.from_preset("paper", env="Humanoid")
-    assert made.sac.alpha == 0.05
+    assert made.learning.alpha == 0.05
     assert made.context.context_length == 10
     sac = Config.from_preset("paper", env="Humanoid", agent="sac")
     assert sac.context.context_length == 1
@@ -183,9 +183,23 @@ def test_preset_authors_holds_their_programs_values() -> None:
     assert {name for name in sac if sac[name] != paper[name]} == {"preset"}
 
 
+@pytest.mark.parametrize("agent", ["td3", "ddpg"])
+def test_preset_paper_runs_the_deterministic_agents_as_cleanrl(agent: str) -> None:
+    flat = Config.from_preset("paper", agent=agent, env="Hopper").flat()
+    theirs = {
+        "num_envs": 1, "total_env_steps": 1_000_000, "actor_learning_rate": 3e-4,
+        "critic_learning_rate": 3e-4, "buffer_capacity": 1_000_000, "discount": 0.99,
+        "tau": 0.005, "batch_size": 256, "prefill_env_steps": 25_000, "action_noise": 0.1,
+        "target_noise": 0.2, "target_noise_clip": 0.5, "policy_delay": 2, "actor_layers": 2,
+        "actor_width": 256, "actor_activation": "relu", "critic_layers": 2, "critic_width": 256,
+        "critic_activation": "relu", "updates_per_env_step": 1.0, "normalize_obs": False,
+    }  # fmt: skip
+    assert {name: flat[name] for name in theirs} == theirs
+
+
 def test_what_the_user_gives_wins_over_the_preset() -> None:
     made = Config.from_preset("paper", env="Humanoid", alpha=0.3, context_length=4)
-    assert made.sac.alpha == 0.3
+    assert made.learning.alpha == 0.3
     assert made.context.context_length == 4
 
 
@@ -251,7 +265,7 @@ def test_prefill_is_rounded_up_to_whole_vector_steps(
 BAD: list[tuple[dict[str, Any], str]] = [
     # What is given, and what the message must hold besides the first field's name.
     ({"num_env": 3}, "did you mean 'num_envs'"),
-    ({"entropy_coefficient": 3}, "'entropy_coefficient' does not exist"),
+    ({"entropy": 3}, "'entropy' does not exist"),
     ({"task": {"env": "Hopper"}}, "'task' does not exist"),
     ({"env": 3}, "env=3"),
     ({"env": None}, "env=None"),
@@ -354,6 +368,12 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"tune_alpha": True, "policy": "deterministic"}, "no entropy"),
     ({"action_noise": -0.1}, "action_noise=-0.1"),
     ({"action_noise_clip": 0.0}, "action_noise_clip=0.0"),
+    ({"policy_delay": 0}, "policy_delay=0"),
+    ({"policy_delay": 1.5}, "policy_delay=1.5"),
+    ({"target_noise": -0.1}, "target_noise=-0.1"),
+    ({"target_noise_clip": 0.0}, "target_noise_clip=0.0"),
+    ({"context_length": 6, "agent": "td3"}, "agent=td3"),
+    ({"return_conditioning": "hindsight", "agent": "ddpg", "context_length": 1}, "agent=ddpg"),
     ({"acting_dropout": True}, "actor_dropout above 0"),
     ({"critic_init": "zeros"}, "critic_init='zeros'"),
     ({"mjx_preset": "quick"}, "mjx_preset='quick'"),

@@ -83,13 +83,13 @@ def test_some_seeds_in_another_order(seeds: Path, tmp_path: Path) -> None:
 def test_a_member_with_its_own_settings_keeps_them(swept: Path, tmp_path: Path) -> None:
     path = extract(swept, ["fast"], tmp_path / "fast")
     run = RunFolder(path).read_config()
-    assert run.config.sac.discount == 0.9
+    assert run.config.learning.discount == 0.9
     assert run.config.seed == 4
     assert run.members == (Member("fast", 4),)
     state, _ = _states(path)
     assert float(state.hyper.discount) == np.float32(0.9)
     # The policy of a member has its settings in its configuration, taken out or not.
-    assert load_policy(swept, "latest", "fast").config.sac.discount == 0.9
+    assert load_policy(swept, "latest", "fast").config.learning.discount == 0.9
     resume(path, 600, quiet=True)
 
 

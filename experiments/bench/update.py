@@ -41,6 +41,7 @@ def full_buffer(program: Program, state: TrainState) -> BufferState:
     """The replay filled with random episodes of full length, none of them running."""
     buffer, limit = program.buffer, program.env.max_episode_steps
     rng = np.random.default_rng(0)
+    assert state.buffer is not None
     steps = state.buffer.steps
     time_step = np.broadcast_to(np.arange(buffer.length) % limit, steps.reward.shape)
     numbers = {
@@ -94,6 +95,7 @@ def updater(program: Program, state: TrainState) -> Callable[[], LearnerState]:
 
 def batch_of(program: Program, state: TrainState) -> Window:
     """A batch from the state's replay."""
+    assert state.buffer is not None
     return program.buffer.sample(
         state.buffer,
         jax.random.key(0),

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from sacformer_jax.agents import sac, sacformer
+from sacformer_jax.agents import ddpg, ppo, sac, sacformer, td3
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.parallel import UNDIVIDED, DataAxis
 
-_MAKERS = {"sacformer": sacformer.make, "sac": sac.make}
+_MAKERS = {
+    "sacformer": sacformer.make,
+    "sac": sac.make,
+    "td3": td3.make,
+    "ddpg": ddpg.make,
+    "ppo": ppo.make,
+}
 
 
 def make(config: Config, spec: EnvSpec, data: DataAxis = UNDIVIDED) -> Agent:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Any, Protocol
 
+import flax.struct
 import jax
 
 from sacformer_jax.types import (
@@ -14,7 +15,7 @@ from sacformer_jax.types import (
     Hyperparameters,
     LearnerState,
     PolicyState,
-    Window,
+    Rollout,
 )
 
 Metrics = dict[str, jax.Array]
@@ -32,11 +33,47 @@ class Act(Protocol):
 
 
 class Update(Protocol):
-    """``update(learner, hyper, window, key) -> (learner, metrics)``: one gradient update."""
+    """``update(learner, hyper, batch, key) -> (learner, metrics)``: one gradient update.
+
+    The batch is a :class:`~sacformer_jax.types.Window`, or rows of :attr:`Prepared.samples`.
+    """
 
     def __call__(
-        self, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
+        self, learner: LearnerState, hyper: Hyperparameters, batch: Any, key: jax.Array, /
     ) -> tuple[LearnerState, Metrics]: ...
+
+
+@flax.struct.dataclass
+class Prepared:
+    """What an agent without a replay makes of a rollout of T steps before it learns from them.
+
+    Attributes:
+      learner: with the statistics of rewards moved on.
+      samples: what its updates learn from: leaves ``[T * N, ...]``, a row for each step.
+      discounted_return: ``[N]`` of the running episodes, after the last step.
+      metrics: of the rollout as a whole.
+    """
+
+    learner: LearnerState
+    samples: Any
+    discounted_return: jax.Array
+    metrics: Metrics
+
+
+class Prepare(Protocol):
+    """``prepare(learner, hyper, rollout, discounted_return) -> Prepared``.
+
+    The learner's observation statistics are those to learn with; ``discounted_return [N]`` is that
+    of the running episodes before the first step.
+    """
+
+    def __call__(
+        self,
+        learner: LearnerState,
+        hyper: Hyperparameters,
+        rollout: Rollout,
+        discounted_return: jax.Array,
+    ) -> Prepared: ...
 
 
 class Init(Protocol):
@@ -59,10 +96,11 @@ class Agent:
       init: makes the learner state.
       init_cache: makes what a context keeps of its whole episode; empty where that is nothing.
       act: chooses actions from contexts.
-      update: one gradient update on a batch of windows. Where a tensor is not finite the networks
-        that it would reach stay as they are; the metric ``fault`` is its place in ``checked``, or
-        -1.
+      update: one gradient update on a batch. Where a tensor is not finite the networks that it
+        would reach stay as they are; the metric ``fault`` is its place in ``checked``, or -1.
       checked: names of the tensors that are looked at, in the order in which they come about.
+      prepare: makes a rollout ready to learn from, of an agent that keeps no replay; None for those
+        that do.
     """
 
     init: Init
@@ -70,3 +108,4 @@ class Agent:
     act: Act
     update: Update
     checked: tuple[str, ...]
+    prepare: Prepare | None = None

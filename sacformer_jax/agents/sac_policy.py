@@ -12,10 +12,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax import normalizer
+from sacformer_jax.agents.off_policy import OffPolicyParts, prepare_obs
 from sacformer_jax.config import Conditioning, Config
 from sacformer_jax.context import commanded_return_to_go
-from sacformer_jax.critics import TwinCritics, make_critics
+from sacformer_jax.critics import make_critics
 from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.networks import ActorOutput, GaussianParams, max_time_step
@@ -38,41 +38,27 @@ _DROPOUT_STREAM = 2**31
 
 
 @dataclasses.dataclass(frozen=True)
-class SACParts:
-    """The static parts of the update.
+class SACParts(OffPolicyParts):
+    """The static parts of the update; its actor has the signature of ``TransformerActor``.
 
     Attributes:
-      actor: network of the signature of :class:`~sacformer_jax.networks.TransformerActor`.
       acting_actor: the same network, as it acts: with a cache or without.
-      critics: twin critics over windows.
       distribution: the policy's distribution over the action bounds.
-      obs_size: O.
-      action_size: A.
-      context_length: K.
       return_conditioning: what the actor is conditioned on in training.
       next_rtg_decrement: hindsight return-to-go after a scattered step is that at the step less
         this; None: its own.
       acting_dropout: dropout is on in acting, too.
       tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
       initial_alpha: α at the start.
-      normalize_obs: use the running observation statistics.
-      data: how environments and batches are split over devices.
     """
 
-    actor: nn.Module
     acting_actor: nn.Module
-    critics: TwinCritics
     distribution: ActionDistribution
-    obs_size: int
-    action_size: int
-    context_length: int
     return_conditioning: Conditioning
     next_rtg_decrement: float | None
     acting_dropout: bool
     tune_alpha: bool
     initial_alpha: float
-    normalize_obs: bool
-    data: DataAxis
 
 
 def sac_parts(
@@ -99,8 +85,8 @@ def sac_parts(
         return_conditioning=config.context.return_conditioning,
         next_rtg_decrement=config.context.next_rtg_decrement,
         acting_dropout=config.actor.acting_dropout,
-        tune_alpha=config.sac.tune_alpha,
-        initial_alpha=config.sac.alpha,
+        tune_alpha=config.learning.tune_alpha,
+        initial_alpha=config.learning.alpha,
         normalize_obs=config.context.normalize_obs,
         data=data,
     )
@@ -111,15 +97,6 @@ def _distribution(config: Config, spec: EnvSpec) -> ActionDistribution:
     if settings.policy == "deterministic":
         return NoisyPoint(low, high, settings.action_noise, settings.action_noise_clip)
     return TanhGaussian(low, high)
-
-
-def prepare_obs(
-    parts: SACParts, learner_or_policy: LearnerState | PolicyState, obs: jax.Array
-) -> jax.Array:
-    """Observations as the networks see them."""
-    if parts.normalize_obs:
-        return normalizer.normalize(learner_or_policy.normalizer, obs)
-    return obs
 
 
 # --- acting ----------------------------------------------------------------------------------
