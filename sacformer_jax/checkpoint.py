@@ -158,12 +158,19 @@ class CheckpointWriter:
             path.mkdir(parents=True, exist_ok=True)
             stored.remove_unfinished(path)  # of a process that was killed
         processes.all_here()
+        # Folders are made before Orbax returns: made beside it, they are waited for by signals that
+        # a policy saved at the same time (save_best) takes for its own; and where a folder cannot
+        # be made, they are waited for 20 minutes.
+        beside = ocp.AsyncOptions(create_directories_asynchronously=False)
         return ocp.CheckpointManager(
-            path, options=ocp.CheckpointManagerOptions(max_to_keep=KEEP, create=False)
+            path,
+            options=ocp.CheckpointManagerOptions(
+                max_to_keep=KEEP, create=False, async_options=beside
+            ),
         )
 
     def _check_writable(self) -> None:
-        """Raises on all processes where no folder can be made: Orbax's would wait for it."""
+        """Raises on all processes where the first cannot make a folder: the others would wait."""
         problem: OSError | None = None
         probe = self._folder.checkpoints_path / f"probe{stored.UNFINISHED}"
         try:
@@ -188,7 +195,7 @@ class CheckpointWriter:
         step = self._writing
         self._close()
         if processes.is_first():
-            stored.remove_failed(self._folder.checkpoints_path, saving=True)  # frees the disk
+            stored.remove_failed(self._folder.checkpoints_path)  # frees the disk
         self._silence.__exit__(type(error), error, error.__traceback__)
         return CheckpointError(
             f"checkpoint {self._folder.checkpoints_path / str(step)} could not be saved "

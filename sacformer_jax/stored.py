@@ -97,37 +97,23 @@ def remove_unfinished(folder: Path) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def remove_failed(folder: Path, saving: bool = False) -> None:
+def remove_failed(folder: Path) -> None:
     """:func:`remove_unfinished` after a save that failed.
 
     Orbax raises the first error while other parts are still being written; they would come back.
 
     Args:
       folder: where it was saved.
-      saving: it was a checkpoint in the background, and not something beside one.
     """
     until = time.monotonic() + 60.0
     for thread in threading.enumerate():
-        of_orbax = type(thread).__module__.startswith("orbax.")
-        if of_orbax and (saving or not getattr(thread, "_receive_signals", None)):
-            _end(thread)
+        if type(thread).__module__.startswith("orbax."):
             threading.Thread.join(thread, timeout=max(0.0, until - time.monotonic()))
     for _ in range(100):  # TensorStore's own threads have no handle
         remove_unfinished(folder)
         time.sleep(0.05)
         if not any(folder.glob(f"*{UNFINISHED}*")):
             break
-
-
-def _end(thread: Any) -> None:
-    """Ends a thread of Orbax, which may wait 20 minutes for a folder that could not be made."""
-    if jax.process_count() > 1:
-        return  # the others would be told that it was made
-    # Orbax has no other way; where it does this one otherwise, the thread is waited for.
-    with contextlib.suppress(AttributeError, KeyError, RuntimeError, TypeError):
-        thread.cancel()
-        tell = vars(sys.modules[type(thread).__module__])["set_signals"]
-        tell(thread._receive_signals, operation_id=thread._operation_id)
 
 
 _ORBAX = f"{os.sep}orbax{os.sep}"

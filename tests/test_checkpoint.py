@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import shutil
@@ -207,6 +208,24 @@ def test_a_best_policy_of_the_same_step_is_replaced(
     save_best(copy, "seed-9", member_policy(states[OLD], 0), BestSoFar(NEW, 7.0))
     restored = restore_policy(copy, program.agent, "best", 1)
     assert digest(restored) == digest(member_policy(states[OLD], 0))
+
+
+def test_nothing_waits_for_a_checkpoint_beside_it(
+    copy: RunFolder, program: Program, states: dict[int, TrainState]
+) -> None:
+    """Orbax's signals of a checkpoint under way are all operations'; the last one removes them, and
+    whoever waits for one then waits for 5 minutes and fails.
+    """
+    futures = importlib.import_module("orbax.checkpoint._src.futures.future")
+    signals = futures.AwaitableSignalsContract.get_awaitable_signals_from_contract
+    policy = policy_of(states[OLD])
+    with CheckpointWriter(copy, program.config) as writer:
+        for step in (400, 500, 600):
+            progress = dataclasses.replace(PROGRESS[OLD], env_steps=step)
+            writer.save(states[OLD], policy, progress)
+            assert not signals()
+            save_best(copy, "seed-4", member_policy(states[OLD], 0), BestSoFar(step, float(step)))
+    assert checkpoint_names(copy)[-1] == "600"
 
 
 def test_host_arrays_can_be_saved_as_best(

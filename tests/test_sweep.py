@@ -243,7 +243,7 @@ def test_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [m.name for m in members] == [f"{table[0]['setting']}-seed-{seed}" for seed in (0, 1)]
     assert {m.values["tau"] for m in members} == {float(table[0]["tau"])}
     assert best.latest_step() == 400
-    assert load_policy(best.path, member="0").config.sac.tau == float(table[0]["tau"])
+    assert load_policy(best.path, member="0").config.learning.tau == float(table[0]["tau"])
     # What was the best before is kept.
     before = load_policy(path / "best-setting-before-1", member="0")
     assert np.array_equal(before.predict(np.ones(11)), first.predict(np.ones(11)))
