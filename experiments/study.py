@@ -1,16 +1,16 @@
-"""Studies: runs by name, trained a few at a time, and one table and picture of their evaluations.
+"""Studies: runs by name, trained a few at a time, one table of their evaluations, its figures.
 
-A study's script makes a :class:`Study` and returns its :meth:`Study.main`. Run NAME lies in
-runs/STUDY/NAME; a run that is done is skipped and one that was stopped is resumed, so a script can
-be stopped (Ctrl-C) and started again at will. Whenever a run ends, results/STUDY.csv and
-results/STUDY.png are written anew; rows of runs that were not asked for stay as they are.
+A study's script makes a :class:`Study` and returns its :meth:`Study.main`. All seeds of a run are
+one program. Run NAME lies in runs/STUDY/NAME; a run that is done is skipped and one that was
+stopped is resumed, so a script can be stopped (Ctrl-C) and started again at will. Whenever a run
+ends, results/STUDY.csv and its figures (figures.py) are written anew; rows of runs that were not
+asked for stay as they are.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import csv
 import dataclasses
 import os
 import signal
@@ -18,26 +18,21 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+
+import figures
+from study_table import Row, read_table, rows_of, summary, write_table
 
 from sacformer_jax import Config, resume, train
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.cli import EXIT_INTERRUPTED
-from sacformer_jax.logging import read_records
-from sacformer_jax.plots import comparison
 
 EXIT_FAILED = 1
-COLUMNS = (
-    "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
-    "return_std", "episodes", "wall_s", "commit",
-)  # fmt: skip
+SCALES = ("cpu", "full")
 _POLL_SECONDS = 0.2
 # What may differ between a run's folder and the study: where it lies and how far it goes.
 _NOT_COMPARED = {"run_dir", "total_env_steps"}
-
-Row = dict[str, Any]
 
 
 @dataclasses.dataclass
@@ -55,8 +50,8 @@ class Study:
 
     Args:
       name: of the study.
-      configs: every run's name, ``[TASK-]VARIANT-SEED``, and configuration; ``run_dir`` is set
-        here.
+      configs: every run's name, ``[TASK-]VARIANT[-SEED]``, and configuration, whose ``seeds`` are
+        trained together; ``run_dir`` is set here.
       script: the file that makes the study; it is started again as the worker of each run.
       runs: where run folders lie; default ``runs/NAME`` below the working directory.
       results: where table and picture go; default ``results`` beside the script.
@@ -76,11 +71,18 @@ class Study:
             run: config.replace(run_dir=str(self.runs / run)) for run, config in configs.items()
         }
         results = results or self.script.parent / "results"
-        self.table, self.picture = results / f"{name}.csv", results / f"{name}.png"
+        self.table = results / f"{name}.csv"
+        self.flags: tuple[str, ...] = ()
 
-    def main(self, arguments: Sequence[str] | None = None) -> int:
+    def main(
+        self,
+        arguments: Sequence[str] | None = None,
+        parents: Sequence[argparse.ArgumentParser] = (),
+    ) -> int:
         """The command line; 0 when all is done, 3 when stopped by a signal, 1 if a run failed."""
-        parser = argparse.ArgumentParser(description=f"Runs of the study {self.name!r}.")
+        parser = argparse.ArgumentParser(
+            description=f"Runs of the study {self.name!r}.", parents=list(parents)
+        )
         parser.add_argument(
             "--only", nargs="+", choices=list(self.configs), metavar="RUN", help="some of the runs"
         )
@@ -113,7 +115,7 @@ class Study:
         shares = [cores[i :: args.jobs] for i in range(args.jobs)] if args.jobs > 1 else [[]]
         code = self._train(names, shares)
         self.write(names)
-        print(self.summary(names))
+        print(summary(read_table(self.table), names))
         return code
 
     # --- running -----------------------------------------------------------------------------
@@ -176,7 +178,7 @@ class Study:
 
     def _start(self, name: str, cores: list[int]) -> _Worker:
         """Starts a run's worker: on the terminal, or with a log where several run side by side."""
-        command = [sys.executable, str(self.script), "--worker", name, "--cores"]
+        command = [sys.executable, str(self.script), *self.flags, "--worker", name, "--cores"]
         command += [str(core) for core in cores]
         log = self.runs / f"{name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -220,92 +222,34 @@ class Study:
 
     def rows(self, name: str) -> list[Row]:
         """A run's evaluations as rows of the table; none if it has not begun."""
-        config, folder = self.configs[name], self._folder(name)
-        metrics = folder.path / "metrics.jsonl"
-        if not metrics.exists():
-            return []
-        seconds, total = {}, 0.0
-        for record in read_records(folder.timings_path):
-            total += record["chunk_seconds"]
-            seconds[record["env_steps"]] = total
         path = self._commits_path(name)
-        return [
-            {
-                "study": self.name,
-                "run": name,
-                "agent": config.agent,
-                "preset": config.preset,
-                "env": config.task.env,
-                "engine": folder.read_spec().engine,
-                "seed": config.seed,
-                "env_steps": record["env_steps"],
-                "return_mean": round(record["return_mean"], 2),
-                "return_std": round(record["return_std"], 2),
-                "episodes": record["episodes"],
-                "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
-                "commit": "+".join(path.read_text().split()) if path.exists() else "unknown",
-            }
-            for record in read_records(metrics, "eval")
-        ]
-
-    def read_table(self) -> list[Row]:
-        """The table as it is on disk."""
-        if not self.table.exists():
-            return []
-        with self.table.open(newline="") as file:
-            return [
-                {
-                    **row,
-                    "env_steps": int(row["env_steps"]),
-                    "return_mean": float(row["return_mean"]),
-                }
-                for row in csv.DictReader(file)
-            ]
+        commits = path.read_text().split() if path.exists() else []
+        return rows_of(self.name, name, self._folder(name), commits)
 
     def write(self, names: Iterable[str]) -> None:
         """Puts the rows of these runs into the table and draws it; other runs' rows stay."""
         new = {name: rows for name in names if (rows := self.rows(name))}
-        kept = [row for row in self.read_table() if row["run"] not in new]
-        order = {name: place for place, name in enumerate(self.configs)}
-        rows = [*kept, *(row for rows in new.values() for row in rows)]
-        rows.sort(key=lambda row: (order.get(row["run"], len(order)), row["env_steps"]))
-        if not rows:
-            return
-        self.table.parent.mkdir(parents=True, exist_ok=True)
-        part = self.table.with_suffix(".part")
-        with part.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        part.replace(self.table)
-        lines = [{**row, "variant": _variant(row)} for row in rows]
-        comparison(lines, self.picture, f"{self.name}: evaluation return")
-
-    def summary(self, names: Iterable[str]) -> str:
-        """A Markdown table: return at the end, mean of the last five evaluations, best, seconds."""
-        wanted = set(names)
-        lines = [
-            "| run | env steps | at the end | last five | best | training, s |",
-            "| --- | --- | --- | --- | --- | --- |",
-        ]
-        by_run: dict[str, list[Row]] = {}
-        for row in self.read_table():
-            by_run.setdefault(row["run"], []).append(row)
-        for name, rows in by_run.items():
-            if name in wanted:
-                returns = [row["return_mean"] for row in rows]
-                last = returns[-5:]
-                lines.append(
-                    f"| {name} | {rows[-1]['env_steps']:,} | {returns[-1]:.0f} "
-                    f"| {sum(last) / len(last):.0f} | {max(returns):.0f} "
-                    f"| {float(rows[-1]['wall_s']):,.0f} |"
-                )
-        return "\n".join(lines)
+        if write_table(self.table, new, list(self.configs)):
+            figures.draw(self.table)
 
 
-def _variant(row: Row) -> str:
-    """What a run stands for: its name without task and seed."""
-    return str(row["run"]).removeprefix(f"{row['env']}-").removesuffix(f"-{row['seed']}")
+def main_of_scales(study_at: Callable[[str], Study], arguments: Sequence[str] | None = None) -> int:
+    """The command line of a study that there is at several scales: :meth:`Study.main` and
+    ``--scale``.
+
+    Args:
+      study_at: makes the study at a scale, one of ``SCALES``.
+      arguments: instead of those of the process.
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument(
+        "--scale", choices=SCALES, default=SCALES[0],
+        help="cpu (default): small networks and few steps; full: those of the paper",
+    )  # fmt: skip
+    scale = parser.parse_known_args(arguments)[0].scale
+    study = study_at(scale)
+    study.flags = ("--scale", scale)
+    return study.main(arguments, [parser])
 
 
 def _cores() -> list[int]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import study as studies
+from study_table import read_table, summary
 
 from sacformer_jax import Config
 from sacformer_jax.checkpoint import RunFolder
@@ -32,74 +35,92 @@ TINY = {
 SPEC = EnvSpec("Hopper", 11, 3, (-1.0,) * 3, (1.0,) * 3, 50, "native", "a test")
 
 
-def _config(seed: int, total: int = 400) -> Config:
-    return Config.from_preset("cpu", **TINY, seed=seed, total_env_steps=total)
+def _config(seeds: tuple[int, ...], total: int = 400) -> Config:
+    chosen = {"seeds": seeds} if len(seeds) > 1 else {"seed": seeds[0]}
+    return Config.from_preset("cpu", **TINY, **chosen, total_env_steps=total)
 
 
-def _pretend(study: studies.Study, name: str, returns: list[float], commits: str = "abc") -> None:
-    """A run's folder with what the table is made of, an evaluation every 100 steps."""
+def _pretend(study: studies.Study, name: str, *returns: list[float], commits: str = "abc") -> None:
+    """A run's folder with what the table is made of, an evaluation every 100 steps.
+
+    Args:
+      study: whose run.
+      name: of it.
+      returns: of each seed.
+      commits: what it was trained by.
+    """
     config = study.configs[name]
     folder = RunFolder(config.run.run_dir)
-    folder.create(config, sources_of(config), SPEC, seed_members([config.seed]))
-    steps = range(100, 100 * len(returns) + 1, 100)
-    metrics_path = folder.path / "metrics.jsonl"
-    with metrics_path.open("w") as metrics, folder.timings_path.open("w") as timings:
-        for step, value in zip(steps, returns, strict=True):
-            record = {"env_steps": step, "return_mean": value, "return_std": 0.5, "episodes": 2}
-            metrics.write(json.dumps({"kind": "train", "env_steps": step}) + "\n")
-            metrics.write(json.dumps({"kind": "eval", **record}) + "\n")
+    members = seed_members(config.all_seeds)
+    folder.create(config, sources_of(config), SPEC, members)
+    steps = range(100, 100 * len(returns[0]) + 1, 100)
+    for member, values in zip(members, returns, strict=True):
+        with folder.metrics_path(member.name).open("w") as metrics:
+            for step, value in zip(steps, values, strict=True):
+                record = {"env_steps": step, "return_mean": value, "return_std": 0.5, "episodes": 2}
+                metrics.write(json.dumps({"kind": "train", "env_steps": step}) + "\n")
+                metrics.write(json.dumps({"kind": "eval", **record}) + "\n")
+    with folder.timings_path.open("w") as timings:
+        for step in steps:
             timings.write(json.dumps({"env_steps": step, "chunk_seconds": 1.5}) + "\n")
     (study.runs / f"{name}.commits").write_text(commits)
 
 
 def _study(folder: Path, script: str = "raise SystemExit(5)") -> studies.Study:
+    """Run ``Hopper-a`` of one seed and ``Hopper-b`` of two."""
     path = folder / "script.py"
     path.write_text(script)
-    configs = {f"run-{seed}": _config(seed) for seed in (0, 1)}
+    configs = {"Hopper-a": _config((3,)), "Hopper-b": _config((5, 4))}
     return studies.Study("tiny", configs, path, runs=folder / "runs")
 
 
 def test_the_table_holds_every_evaluation(tmp_path: Path) -> None:
     study = _study(tmp_path)
-    _pretend(study, "run-1", [1.0, 2.0], "abc\ndef-dirty\n")
-    study.write(["run-0", "run-1"])  # run-0 has not begun
+    _pretend(study, "Hopper-b", [1.0, 2.0], [8.0, 9.0], commits="abc\ndef-dirty\n")
+    study.write(["Hopper-a", "Hopper-b"])  # Hopper-a has not begun
     with (tmp_path / "results" / "tiny.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["env_steps"], row["return_mean"], row["wall_s"]) for row in rows] == [
-        ("100", "1.0", "1.5"),
-        ("200", "2.0", "3.0"),
+    assert [(row["seed"], row["env_steps"], row["return_mean"], row["wall_s"]) for row in rows] == [
+        ("4", "100", "8.0", "1.5"),
+        ("4", "200", "9.0", "3.0"),
+        ("5", "100", "1.0", "1.5"),
+        ("5", "200", "2.0", "3.0"),
     ]
-    same = {"study": "tiny", "run": "run-1", "agent": "sac", "env": "Hopper", "seed": "1",
-            "engine": "native", "preset": "cpu", "commit": "abc+def-dirty"}  # fmt: skip
+    same = {"study": "tiny", "run": "Hopper-b", "agent": "sac", "env": "Hopper",
+            "engine": "native", "preset": "cpu", "return_std": "0.5", "episodes": "2",
+            "commit": "abc+def-dirty"}  # fmt: skip
     assert all(row.items() >= same.items() for row in rows)
     assert (tmp_path / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_rows_of_runs_not_asked_for_stay(tmp_path: Path) -> None:
     study = _study(tmp_path)
-    _pretend(study, "run-1", [1.0, 2.0])
-    study.write(["run-1"])
-    before = study.read_table()
+    _pretend(study, "Hopper-b", [1.0, 2.0], [3.0, 4.0])
+    study.write(["Hopper-b"])
+    before = read_table(study.table)
     # Trained on another machine, say: no folder here any more.
-    (study.runs / "run-1" / "metrics.jsonl").unlink()
-    _pretend(study, "run-0", [3.0])
-    study.write(["run-0", "run-1"])
-    after = study.read_table()
-    assert [row["run"] for row in after] == ["run-0", "run-1", "run-1"]  # the study's order
+    shutil.rmtree(study.runs / "Hopper-b")
+    _pretend(study, "Hopper-a", [5.0])
+    study.write(["Hopper-a", "Hopper-b"])
+    after = read_table(study.table)
+    assert [row["run"] for row in after] == ["Hopper-a", *4 * ["Hopper-b"]]  # the study's order
     assert after[1:] == before
-    _pretend(study, "run-0", [4.0, 5.0])
-    study.write(["run-0"])
-    assert [row["return_mean"] for row in study.read_table()] == [4.0, 5.0, 1.0, 2.0]
+    _pretend(study, "Hopper-a", [6.0, 7.0])
+    study.write(["Hopper-a"])
+    assert [row["return_mean"] for row in read_table(study.table)] == [6.0, 7.0, 3.0, 4.0, 1.0, 2.0]
 
 
 def test_the_summary(tmp_path: Path) -> None:
     study = _study(tmp_path)
-    _pretend(study, "run-0", [100.0, 60.0, 1.0, 2.0, 3.0, 4.0])
-    _pretend(study, "run-1", [7.0])
+    _pretend(study, "Hopper-a", [7.0])
+    _pretend(study, "Hopper-b", [100.0, 60.0, 1.0, 2.0, 3.0, 4.0], [0.0] * 6)
     study.write(study.configs)
-    lines = study.summary(["run-0"]).splitlines()
-    assert lines[2:] == ["| run-0 | 600 | 4 | 14 | 100 | 9 |"]
-    assert len(study.summary(study.configs).splitlines()) == 4
+    rows = read_table(study.table)
+    assert summary(rows, ["Hopper-b"]).splitlines()[2:] == [
+        "| Hopper-b | 4 | 600 | 0 | 0 | 0 | 9 |",
+        "| Hopper-b | 5 | 600 | 4 | 14 | 100 | 9 |",
+    ]
+    assert len(summary(rows, study.configs).splitlines()) == 5
 
 
 def test_a_worker_that_fails_is_reported_and_the_others_run(
@@ -108,10 +129,31 @@ def test_a_worker_that_fails_is_reported_and_the_others_run(
     script = "import sys\nprint('worker of', sys.argv[2], flush=True)\nsys.exit(5)"
     assert _study(tmp_path, script).main([]) == studies.EXIT_FAILED == 1
     out, err = capfd.readouterr()
-    assert "worker of run-0" in out
-    assert "worker of run-1" in out
-    assert "run-0: ended with code 5" in out
-    assert err == "failed: run-0, run-1\n"
+    assert "worker of Hopper-a" in out
+    assert "worker of Hopper-b" in out
+    assert "Hopper-a: ended with code 5" in out
+    assert err == "failed: Hopper-a, Hopper-b\n"
+
+
+def test_workers_are_started_at_the_scale_asked_for(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    script = "import sys\nprint(*sys.argv[1:4], flush=True)"
+    asked: list[str] = []
+
+    def study_at(scale: str) -> studies.Study:
+        asked.append(scale)
+        return _study(tmp_path, script)
+
+    assert studies.main_of_scales(study_at, ["--scale", "full", "--only", "Hopper-b"]) == 0
+    assert studies.main_of_scales(study_at, ["--list"]) == 0
+    assert asked == ["full", "cpu"]
+    out = capfd.readouterr().out
+    assert "--scale full --worker\n" in out
+    assert out.endswith("Hopper-a\nHopper-b\n")
+    with pytest.raises(SystemExit):
+        studies.main_of_scales(study_at, ["--help"])
+    assert "--scale {cpu,full}" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("jobs", ["0", "-1", "100000", "two"])
@@ -127,18 +169,55 @@ def test_impossible_numbers_of_jobs_are_refused(
 
 def test_an_unknown_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as refused:
-        _study(tmp_path).main(["--only", "run-7"])
+        _study(tmp_path).main(["--only", "Hopper-7"])
     assert refused.value.code == 2
-    assert "run-7" in capsys.readouterr().err
+    assert "Hopper-7" in capsys.readouterr().err
 
 
-def test_the_foundation_study_names_its_runs() -> None:
+SCRIPTS = ("figure2", "figure3", "ablations")
+
+
+@pytest.mark.parametrize("scale", studies.SCALES)
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_every_study_can_be_trained_as_it_is(name: str, scale: str) -> None:
+    study = importlib.import_module(name).study(scale)
+    assert study.name == f"{name}-{scale}"
+    for run, config in study.configs.items():
+        config.validated()
+        assert run.startswith(f"{config.task.env}-")
+        assert len(config.all_seeds) >= 3
+        assert config.preset == {"cpu": "cpu", "full": "paper"}[scale]
+
+
+def test_the_studies_are_those_of_the_paper() -> None:
+    runs = {name: set(importlib.import_module(name).study("full").configs) for name in SCRIPTS}
+    agents, tasks = (
+        ["sacformer", "sac", "td3", "ddpg", "ppo"],
+        ["HalfCheetah", "Hopper", "Walker2d", "Ant"],
+    )
+    assert runs["figure2"] == {f"{task}-{agent}" for task in tasks for agent in agents}
+    assert runs["figure3"] >= {f"Humanoid-K={length}" for length in (5, 10, 15)}
     listed = subprocess.run(
-        [sys.executable, EXPERIMENTS / "foundation.py", "--list"],
+        [sys.executable, EXPERIMENTS / "ablations.py", "--list", "--scale", "full"],
         capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
-    assert len(listed) == 12
-    assert {"Hopper-sac-0", "HalfCheetah-sacformer-1"} <= set(listed)
+    assert set(listed) == runs["ablations"]
+
+
+def test_ablations_change_one_thing_of_the_preset() -> None:
+    for scale in studies.SCALES:
+        configs = importlib.import_module("ablations").study(scale).configs
+        for run, config in configs.items():
+            task = config.task.env
+            default = configs[f"{task}-sacformer"].flat()
+            changed = {name for name, value in config.flat().items() if value != default[name]}
+            changed -= {"run_dir", "prefill_env_steps"}
+            allowed = {
+                "transformer-critic": {"critic", "critic_width", "critic_heads"},
+                "acting-4K": {"acting_context", "acting_context_limit"},
+            }.get(run.removeprefix(f"{task}-"))
+            assert len(changed) <= 1 or changed <= (allowed or set()), (run, changed)
+            assert changed or run.endswith("-sacformer")
 
 
 def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
@@ -152,9 +231,8 @@ def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
             fields = {TINY!r} | {{"critic_width": int(os.environ.get("WIDTH", "8"))}}
             total = int(os.environ["TOTAL"])
             configs = {{
-                f"run-{{seed}}": Config.from_preset(
-                    "cpu", **fields, seed=seed, total_env_steps=total)
-                for seed in (0, 1)
+                name: Config.from_preset("cpu", **fields, **seeds, total_env_steps=total)
+                for name, seeds in {{"Hopper-a": {{"seeds": 2}}, "Hopper-b": {{"seed": 2}}}}.items()
             }}
             sys.exit(Study("tiny", configs, __file__).main())
         """)
@@ -179,8 +257,8 @@ def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
         endless.kill()
     assert endless.returncode == 3, said
     assert "Traceback" not in said
-    assert "run-1: started" not in said
-    stopped_at = RunFolder(tmp_path / "runs" / "tiny" / "run-0").latest_step()
+    assert "Hopper-b: started" not in said
+    stopped_at = RunFolder(tmp_path / "runs" / "tiny" / "Hopper-a").latest_step()
     assert stopped_at is not None
 
     total = max(400, stopped_at + 100)
@@ -189,8 +267,10 @@ def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
     assert ended.returncode == 0, said
     table = (tmp_path / "results" / "tiny.csv").read_text()
     rows = list(csv.DictReader(table.splitlines()))
-    assert {row["run"] for row in rows if row["env_steps"] == str(total)} == {"run-0", "run-1"}
-    assert f"| run-0 | {total:,} |" in said
+    assert {(row["run"], row["seed"]) for row in rows if row["env_steps"] == str(total)} == {
+        ("Hopper-a", "0"), ("Hopper-a", "1"), ("Hopper-b", "2"),
+    }  # fmt: skip
+    assert f"| Hopper-a | 1 | {total:,} |" in said
 
     again = start(total=total)
     said, _ = again.communicate()
@@ -201,10 +281,4 @@ def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
     changed = start(total=total, WIDTH="16")
     said, _ = changed.communicate()
     assert changed.returncode == 2
-    assert "run-0 was trained with other settings (critic_width)" in said
-
-
-def test_a_runs_name_without_task_and_seed_is_its_variant() -> None:
-    row = {"env": "Hopper", "seed": "1"}
-    names = {"Hopper-sac-1": "sac", "64-windows-1": "64-windows", "Ant-sac-1": "Ant-sac"}
-    assert {name: studies._variant({**row, "run": name}) for name in names} == names
+    assert "Hopper-a was trained with other settings (critic_width)" in said

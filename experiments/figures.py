@@ -1,0 +1,102 @@
+"""Figures and tables of studies, made of experiments/results/*.csv: nothing is trained.
+
+python experiments/figures.py                     # of every study
+python experiments/figures.py figure2-cpu         # of one
+
+Beside STUDY.csv it writes STUDY.png and STUDY.svg (learning curves), STUDY-scores.png and .svg
+(intervals, where there are six variants or more), STUDY.md and STUDY-scores.csv. The same table
+gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+from curves_figure import grid_figure, panels_figure
+from figure_page import FONTS
+from figure_styles import MOST_LINES
+from intervals_figure import intervals_figure
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from report_tables import aggregates, markdown, scores_csv
+from study_lines import is_study_table, read_study
+
+RESULTS = Path(__file__).parent / "results"
+INTERVALS_FROM = 6
+"""Variants from which on there is a figure of intervals."""
+_DPI = 200
+
+
+def draw(table: Path, baseline: str | None = None) -> list[Path]:
+    """Makes all figures and tables of a study, beside its table.
+
+    Args:
+      table: ``results/STUDY.csv``.
+      baseline: the variant that others are compared with; default: SAC where it is among them,
+        else the one without changes.
+
+    Returns:
+      the files; none where no line has an evaluation yet.
+    """
+    study = read_study(table)
+    if study is None or not study.last_step:
+        return []
+    if baseline is not None and baseline not in study.variants:
+        raise ValueError(f"baseline {baseline!r}: {table.name} has {', '.join(study.variants)}")
+    baseline = baseline or study.baseline()
+    made = aggregates(study, baseline)
+    texts = {
+        f"{study.name}.md": markdown(study, made, baseline),
+        f"{study.name}-scores.csv": scores_csv(study, made),
+    }
+    paths = []
+    for name, text in texts.items():
+        paths.append(table.with_name(name))
+        paths[-1].write_text(text)
+    with matplotlib.rc_context(FONTS):
+        many = len(study.variants) > MOST_LINES
+        curves = grid_figure(study, baseline) if many else panels_figure(study)
+        paths += _save(curves, table.with_name(study.name))
+        rated = sum(one.iqm is not None for one in made)
+        if len(study.variants) >= INTERVALS_FROM and rated > 1:
+            intervals = intervals_figure(study, made, baseline)
+            paths += _save(intervals, table.with_name(f"{study.name}-scores"))
+    return paths
+
+
+def _save(figure: Figure, stem: Path) -> list[Path]:
+    """As PNG and SVG, without anything that differs from time to time."""
+    FigureCanvasAgg(figure)
+    png, svg = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.svg")
+    figure.savefig(png, dpi=_DPI, metadata={"Software": None})
+    with matplotlib.rc_context({"svg.hashsalt": stem.name}):
+        figure.savefig(svg, metadata={"Date": None, "Creator": None})
+    return [png, svg]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Figures and tables of studies.")
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help="default: all in the folder")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
+    parser.add_argument("--baseline", help="the variant that others are compared with")
+    args = parser.parse_args(arguments)
+    there = {path.stem: path for path in sorted(args.results.glob("*.csv")) if is_study_table(path)}
+    unknown = [name for name in args.studies if name not in there]
+    if unknown:
+        parser.error(f"{', '.join(unknown)}: no such table; there are {', '.join(there)}")
+    for name in args.studies or there:
+        try:
+            paths = draw(there[name], args.baseline)
+        except ValueError as error:
+            parser.error(str(error))
+        print(f"{name}: {', '.join(path.name for path in paths) or 'nothing to draw yet'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,358 @@
+"""Figures and tables of studies: what they show is what the tables hold."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import figures
+import numpy as np
+import pytest
+from curves_figure import grid_figure, panels_figure
+from figure_styles import AGENTS, Style, styles_of
+from intervals_figure import intervals_figure
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from report_tables import aggregates, markdown
+from scores import RANDOM_RETURNS, REFERENCE_RETURNS
+from study_lines import StudyLines, read_study
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+COLUMNS = (
+    "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
+    "return_std", "episodes", "wall_s", "commit",
+)  # fmt: skip
+Runs = Mapping[str, Sequence[Sequence[float]]]
+
+
+def write(path: Path, runs: Runs, agent: str | None = None, every: int = 1_000) -> Path:
+    """A table of ``{TASK-VARIANT: [returns of seed 0, of seed 1, …]}``."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for run, seeds in runs.items():
+            task, variant = run.split("-", 1)
+            for seed, returns in enumerate(seeds):
+                for place, value in enumerate(returns, 1):
+                    row = (path.stem, run, agent or variant, "cpu", task, "native", seed,
+                           every * place, value, 1.0, 4, 0.5, "abc")  # fmt: skip
+                    writer.writerow(row)
+    return path
+
+
+def read(*args: object, **kwargs: object) -> StudyLines:
+    study = read_study(write(*args, **kwargs))  # type: ignore[arg-type]
+    assert study is not None
+    return study
+
+
+def panels(figure: Figure) -> dict[str, Axes]:
+    return {axes.get_title(): axes for axes in figure.axes}
+
+
+def line_of(axes: Axes, label: str) -> tuple[list[float], list[float]]:
+    """What is plotted: x and y."""
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return list(line.get_xdata()), list(line.get_ydata())
+
+
+def band_of(axes: Axes, place: int) -> dict[float, tuple[float, float]]:
+    """Lowest and highest y of a band, by x."""
+    vertices = axes.collections[place].get_paths()[0].vertices
+    by_x: dict[float, list[float]] = {}
+    for x, y in vertices:
+        by_x.setdefault(float(x), []).append(float(y))
+    return {x: (min(ys), max(ys)) for x, ys in by_x.items()}
+
+
+def caption_of(figure: Figure) -> str:
+    (text,) = figure.texts
+    return " ".join(text.get_text().split())
+
+
+def returns_for(task: str, *scores: float) -> list[float]:
+    low = RANDOM_RETURNS[task]
+    return [low + score * (REFERENCE_RETURNS[task] - low) for score in scores]
+
+
+TWO_AGENTS = {
+    "Hopper-sacformer": [[10, 20, 30], [30, 60, 50]],
+    "Hopper-sac": [[1, 2, 3], [3, 2, 1]],
+    "HalfCheetah-sacformer": [[100, 300, 200], [0, 100, 400]],
+    "HalfCheetah-sac": [[5, 5, 5], [7, 9, 11]],
+}
+
+
+def test_lines_are_means_and_bands_the_range_of_seeds(tmp_path: Path) -> None:
+    study = read(tmp_path / "two.csv", TWO_AGENTS)
+    figure = panels_figure(study)
+    axes = panels(figure)
+    assert list(axes) == ["HalfCheetah", "Hopper", "IQM over tasks"]
+    assert line_of(axes["Hopper"], "SACFormer") == ([1, 2, 3], [20, 40, 40])
+    assert line_of(axes["HalfCheetah"], "SAC") == ([1, 2, 3], [6, 7, 8])
+    assert band_of(axes["Hopper"], 0) == {1: (10, 30), 2: (20, 60), 3: (30, 50)}
+    assert band_of(axes["HalfCheetah"], 1) == {1: (5, 7), 2: (5, 9), 3: (5, 11)}
+    assert axes["Hopper"].get_xlabel() == "env steps (thousands)"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["SACFormer", "SAC"]
+    caption = caption_of(figure)
+    assert caption.startswith(
+        "Study two: 2 seeds, 3,000 env steps, 4 episodes an evaluation, engine native, preset cpu. "
+        "Lines: mean over seeds, not smoothed. Bands: lowest to highest seed."
+    )
+    assert "Not finished" not in caption
+
+
+def test_the_average_is_the_interquartile_mean_of_normalized_scores(tmp_path: Path) -> None:
+    runs = {
+        f"{task}-sac": [[value] for value in returns_for(task, *scores)]
+        for task, scores in {"Hopper": (0.0, 0.4), "Ant": (0.6, 1.5)}.items()
+    }
+    axes = panels(panels_figure(read(tmp_path / "average.csv", runs)))["IQM over tasks"]
+    assert line_of(axes, "SAC")[1] == pytest.approx([0.5], abs=1e-9)
+    # Of 16 resamples the lowest and the highest, trimmed: (0, 0, .6, .6) and (.4, .4, 1.5, 1.5).
+    assert band_of(axes, 0)[1] == pytest.approx((0.3, 0.95), abs=1e-9)
+
+
+def test_many_seeds_have_a_bootstrap_band(tmp_path: Path) -> None:
+    # The sum of five draws from 0, 0, 0, 0, 10 is over 30 in 0.7 % of all, over 20 in 6 %.
+    study = read(tmp_path / "many.csv", {"Hopper-sac": [[0], [0], [0], [0], [10]]}, every=10**6)
+    figure = panels_figure(study)
+    (axes,) = figure.axes
+    assert line_of(axes, "SAC") == ([1], [2])
+    assert band_of(axes, 0) == {1: (0, 6)}
+    assert axes.get_xlabel() == "env steps (millions)"
+    assert "5 seeds, 1,000,000 env steps" in caption_of(figure)
+    assert "Bands: 95 % bootstrap interval of the mean." in caption_of(figure)
+
+
+def test_runs_in_progress(tmp_path: Path) -> None:
+    runs = {
+        **TWO_AGENTS,
+        "Hopper-td3": [[1, 2, 3], [3, 4]],  # a seed of its own is behind
+        "Hopper-ppo": [[9, 8, 7]],
+        "HalfCheetah-ppo": [[9, 8]],
+    }
+    study = read(tmp_path / "progress.csv", runs)
+    figure = panels_figure(study)
+    axes = panels(figure)
+    assert line_of(axes["Hopper"], "TD3") == ([1, 2], [2, 3])
+    assert line_of(axes["IQM over tasks"], "PPO")[0] == [1, 2]
+    average = {line.get_label() for line in axes["IQM over tasks"].lines}
+    assert average == {"SACFormer", "SAC", "PPO"}
+    caption = caption_of(figure)
+    assert "1 to 2 seeds, 3,000 env steps" in caption
+    assert "Without TD3, not begun on every task." in caption
+    assert caption.endswith(
+        "Not finished: TD3 on HalfCheetah (not begun); TD3 on Hopper (2,000 env steps); "
+        "PPO on HalfCheetah (2,000 env steps)."
+    )
+    made = {one.variant: one for one in aggregates(study, "sac")}
+    assert made["td3"].iqm is made["td3"].improvement is made["ppo"].iqm is None
+    assert made["ppo"].tasks == ["Hopper"]
+    assert made["ppo"].improvement is not None
+    assert made["ppo"].improvement.value == 1.0
+    text = markdown(study, list(made.values()), "sac")
+    assert "| PPO | – | 1.00 on Hopper only |" in text
+    assert "| TD3 | – † | 2 ± 1 (2 / 4) † |" in text
+    assert "| PPO | 8 (8) † | 8 (8) |" in text
+    assert "\n† Not finished: TD3 on HalfCheetah (not begun); TD3 on Hopper" in text
+
+
+def test_a_table_of_markdown(tmp_path: Path) -> None:
+    study = read(tmp_path / "figure2-cpu.csv", {
+        "Hopper-sacformer": [[999, *[20] * 5], [0, 10, 20, 30, 40, 0]],
+        "Hopper-sac": [[0, *[10] * 5], [0, 30, 30, 30, 30, 30]],
+        "Hopper-ppo": [[0, *[1] * 5]],
+    })  # fmt: skip
+    assert study.baseline() == "sac"
+    lines = markdown(study, aggregates(study, "sac"), "sac").splitlines()
+    assert lines[0] == "# Study figure2-cpu"
+    assert "| SACFormer | 20 ± 0 (20 / 20) |" in lines
+    assert "| SAC | 20 ± 14 (10 / 30) |" in lines
+    assert "| PPO | 1 (1) |" in lines
+    assert lines[-5] == "|  | interquartile mean | P(better than SAC) |"
+    assert lines[-3:] == [
+        "| SACFormer | 0.00 [0.00, 0.00] | 0.50 [0.00, 1.00] |",
+        "| SAC | 0.00 [-0.00, 0.01] | – |",
+        "| PPO | -0.01 | 0.00 |",
+    ]
+
+
+def test_the_table_of_scores(tmp_path: Path) -> None:
+    table = write(tmp_path / "baselines.csv", {
+        "Hopper-td3": [[0, *[3135] * 5], [0, *[0] * 5]], "Hopper-sac": [[1.0], [2.0]],
+    })  # fmt: skip
+    figures.draw(table)
+    with (tmp_path / "baselines-scores.csv").open(newline="") as file:
+        rows = {
+            (row["task"], row["variant"], row["statistic"], row["seed"]): row["value"]
+            for row in csv.DictReader(file)
+        }
+    assert rows["Hopper", "td3", "score", "0"] == "3135.00"
+    assert rows["Hopper", "td3", "score", "1"] == "0.00"
+    assert rows["Hopper", "td3", "mean", ""] == "1567.50"
+    assert rows["Hopper", "td3", "std", ""] == f"{3135 / 2**0.5:.2f}"
+    assert rows["Hopper", "td3", "ratio_to_cleanrl", ""] == "0.5000"
+    assert rows["Hopper", "td3", "env_steps", ""] == "6000"
+    assert float(rows["", "td3", "iqm", ""]) == pytest.approx((1567.5 - 17.7) / (2326 - 17.7), 1e-3)
+    assert ("", "sac", "iqm", "") not in rows  # in progress
+    published = (tmp_path / "baselines.md").read_text()
+    assert "| Hopper | TD3 | 1,568 | 0.50 | 3,135 | 3,472 | 3,606 | 6,000 |" in published
+
+
+MANY = ["sacformer", *(f"change-{letter}" for letter in "abcdefg")]
+MANY_RUNS = {
+    f"{task}-{variant}": [
+        returns_for(task, 0.0, 0.1 * place), returns_for(task, 0.0, 0.1 * place + 0.02)
+    ]
+    for place, variant in enumerate(MANY) for task in ("Hopper", "Walker2d")
+}  # fmt: skip
+
+
+def test_many_variants_have_a_row_each(tmp_path: Path) -> None:
+    study = read(tmp_path / "ablations.csv", MANY_RUNS, agent="sacformer")
+    assert study.baseline() == "sacformer"
+    figure = grid_figure(study, "sacformer")
+    rows = np.array(figure.axes).reshape(7, 3)
+    assert [row[0].get_ylabel() for row in rows] == MANY[1:]
+    assert [axes.get_title() for axes in rows[0]][::2] == ["Hopper, return", "IQM over tasks"]
+    for place, row in enumerate(rows, 1):
+        expected = returns_for("Walker2d", 0.1 * place + 0.01)
+        assert line_of(row[1], MANY[place])[1][1] == pytest.approx(expected[0])
+        assert line_of(row[2], MANY[place])[1][1] == pytest.approx(0.1 * place + 0.01)
+        assert line_of(row[2], "SACFormer")[1][1] == pytest.approx(0.01)
+
+
+def test_intervals_are_sorted(tmp_path: Path) -> None:
+    study = read(tmp_path / "ablations.csv", MANY_RUNS, agent="sacformer")
+    figure = intervals_figure(study, aggregates(study, "sacformer"), "sacformer")
+    left, right = figure.axes
+    assert [tick.get_text() for tick in left.get_yticklabels()] == [*MANY[:0:-1], "SACFormer"]
+    best = [line.get_xdata() for line in left.lines if line.get_ydata()[0] == 0]
+    score = [0.35, 0.36]  # two evaluations are the whole score
+    assert list(best[0]) == pytest.approx(score)
+    assert list(best[1]) == pytest.approx([np.mean(score)])
+    points = [line.get_xdata()[0] for line in right.lines if line.get_marker() == "o"]
+    assert points == [1.0] * 7
+
+
+def test_files_are_the_same_every_time_and_made_without_jax(tmp_path: Path) -> None:
+    runs = {f"Hopper-K={length}": [[1, 2], [length, 3], [4, length]] for length in range(6)}
+    first, again = tmp_path / "first", tmp_path / "again"
+    for folder in (first, again):
+        folder.mkdir()
+        write(folder / "lengths.csv", runs, agent="sacformer")
+    paths = figures.draw(first / "lengths.csv")
+    program = (
+        "import sys, figures; "
+        "code = figures.main(['--results', sys.argv[1]]); "
+        "sys.exit(code or 'jax' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program, again], cwd=EXPERIMENTS, check=True)
+    names = {path.name for path in paths}
+    assert names == {f"lengths{end}" for end in (
+        ".png", ".svg", ".md", "-scores.csv", "-scores.png", "-scores.svg"
+    )}  # fmt: skip
+    assert {path.name for path in again.iterdir()} == {*names, "lengths.csv"}
+    for path in paths:
+        assert path.read_bytes() == (again / path.name).read_bytes(), path.name
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_captions_and_legends_lie_within_the_page(tmp_path: Path, seeds: int) -> None:
+    tasks = ("HalfCheetah", "Hopper", "Walker2d", "Ant")
+    runs = {f"{task}-{agent}": [[1, 2]] * seeds for agent in AGENTS for task in tasks}
+    del runs["Ant-ddpg"]
+    study = read(tmp_path / "figure2-full.csv", runs)
+    with figures.matplotlib.rc_context(figures.FONTS):
+        figure = panels_figure(study)
+        figures.FigureCanvasAgg(figure).draw()
+        (caption,) = figure.texts
+        boxes = [caption.get_window_extent(), figure.legends[0].get_window_extent()]
+        boxes += [axes.get_tightbbox() for axes in figure.axes]
+        for box in boxes:
+            assert box.x0 >= 0
+            assert box.x1 <= figure.bbox.width
+            assert box.y0 >= 0
+        assert boxes[0].y1 <= boxes[1].y0
+        assert all(boxes[1].y1 <= box.y0 for box in boxes[2:])
+
+
+def lightness(style: Style) -> float:
+    """L* of CIELAB, from 0 (black) to 100 (white)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+              for c in to_rgb(style.color)]  # fmt: skip
+    luminance = float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
+    return 116 * luminance ** (1 / 3) - 16 if luminance > 0.008856 else 903.3 * luminance
+
+
+@pytest.mark.parametrize("variants", [
+    list(AGENTS), ["K=1", "K=2", "K=5", "K=10", "K=15", "K=20"], ["sacformer", *"abcde"],
+    ["sac", "a"], ["a"],
+])  # fmt: skip
+def test_lines_can_be_told_apart_without_colour(variants: list[str]) -> None:
+    styles = styles_of(variants)
+    assert styles.keys() == set(variants)
+    for one, other in itertools.combinations(styles.values(), 2):
+        assert one.dashes != other.dashes
+        assert one.marker != other.marker
+        assert abs(lightness(one) - lightness(other)) > 6
+    assert all(lightness(style) < 80 for style in styles.values())  # prints on white
+
+
+def test_an_agent_looks_the_same_in_every_figure() -> None:
+    assert styles_of(["sac", "a"])["sac"] == styles_of(["ppo", "sac"])["sac"] == AGENTS["sac"]
+    with pytest.raises(ValueError, match="7 lines"):
+        styles_of(list("abcdefg"))
+
+
+@pytest.mark.parametrize("name", ["foundation", "hopper", "variants"])
+def test_tables_of_separate_seeds(name: str) -> None:
+    study = read_study(EXPERIMENTS / "results" / f"{name}.csv")
+    assert study is not None
+    assert all(line.seeds == [0, 1] for line in study.lines.values())
+    assert all(study.finished(*key) for key in study.lines)
+    expected = {"foundation": 2 * 3, "hopper": 4, "variants": 15 * 2}
+    assert len(study.lines) == expected[name]
+
+
+def test_variants_of_numbers_are_in_their_order(tmp_path: Path) -> None:
+    runs = {f"Humanoid-K={length}": [[1.0]] for length in (5, 10, 15, 1, 2, 20)}
+    study = read(tmp_path / "figure3.csv", runs, agent="sacformer")
+    assert study.variants == ["K=1", "K=2", "K=5", "K=10", "K=15", "K=20"]
+    assert study.baseline() == "K=10"
+
+
+def test_agents_are_in_the_same_order_everywhere(tmp_path: Path) -> None:
+    runs = {f"Hopper-{agent}": [[1.0]] for agent in ("ppo", "td3", "ddpg", "sac")}
+    assert read(tmp_path / "baselines.csv", runs).variants == ["sac", "td3", "ddpg", "ppo"]
+
+
+def test_tasks_without_a_scale_have_no_average(tmp_path: Path) -> None:
+    runs = {"brax:ant-sac": [[1], [2]], "tiny-sac": [[3], [4]], "tiny-td3": [[5], [6]]}
+    study = read(tmp_path / "tiny.csv", runs)
+    assert list(panels(panels_figure(study))) == ["brax:ant", "tiny"]
+    made = aggregates(study, "sac")
+    assert [one.iqm for one in made] == [None, None]
+    assert "| TD3 | – | 1.00 [1.00, 1.00] on tiny only |" in markdown(study, made, "sac")
+
+
+def test_tables_without_rows_and_strange_arguments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = write(tmp_path / "empty.csv", {})
+    assert figures.draw(empty) == []
+    table = write(tmp_path / "some.csv", {"Hopper-sac": [[1]]})
+    (tmp_path / "some-scores.csv").write_text("study,task,variant\n")
+    with pytest.raises(ValueError, match=r"'td3': some\.csv has sac"):
+        figures.draw(table, baseline="td3")
+    for arguments in (["none"], ["some", "--baseline", "td3"], ["some-scores"]):
+        with pytest.raises(SystemExit) as refused:
+            figures.main([*arguments, "--results", str(tmp_path)])
+        assert refused.value.code == 2
+    assert "there are empty, some\n" in capsys.readouterr().err
