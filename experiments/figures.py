@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
-from curves_figure import grid_figure, panels_figure
-from figure_page import FONTS
-from figure_styles import MOST_LINES
-from intervals_figure import intervals_figure
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from report_tables import aggregates, markdown, scores_csv
-from study_lines import is_study_table, read_study
+from report.curves import grid_figure, panels_figure
+from report.intervals import intervals_figure
+from report.lines import is_study_table, read_study
+from report.page import FONTS
+from report.styles import MOST_LINES
+from report.tables import aggregates, markdown, scores_csv
 
 RESULTS = Path(__file__).parent / "results"
 INTERVALS_FROM = 6

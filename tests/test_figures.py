@@ -12,15 +12,15 @@ from pathlib import Path
 import figures
 import numpy as np
 import pytest
-from curves_figure import grid_figure, panels_figure
-from figure_styles import AGENTS, Style, styles_of
-from intervals_figure import intervals_figure
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from report_tables import aggregates, markdown
-from scores import RANDOM_RETURNS, REFERENCE_RETURNS
-from study_lines import StudyLines, read_study
+from report.curves import grid_figure, panels_figure
+from report.intervals import intervals_figure
+from report.lines import StudyLines, read_study
+from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS
+from report.styles import AGENTS, Style, styles_of
+from report.tables import aggregates, markdown
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 COLUMNS = (

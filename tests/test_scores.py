@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-import scores
-from published_returns import CLEANRL, PUBLISHED, ratio_to_cleanrl
-from scores import iqm_estimate, mean_estimate, probability_of_improvement
+from random_returns import random_returns
+from report import scores
+from report.published import CLEANRL, PUBLISHED, ratio_to_cleanrl
+from report.scores import iqm_estimate, mean_estimate, probability_of_improvement
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -178,7 +179,7 @@ def test_published_returns() -> None:
 
 @pytest.mark.filterwarnings("default")
 def test_random_actions_give_what_is_written_down() -> None:
-    returns = scores.random_returns("Hopper", episodes=32, seed=5)
+    returns = random_returns("Hopper", episodes=32, seed=5)
     error = returns.std(ddof=1) / np.sqrt(returns.size)
     assert returns.shape == (32,)
     assert error > 0

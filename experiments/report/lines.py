@@ -13,7 +13,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scores import REFERENCE_RETURNS, run_scores, variant_of
+
+from report.scores import REFERENCE_RETURNS, run_scores, variant_of
 
 FINISHED_SHARE = 0.95
 """A line that ends before this share of the study's longest is in progress. Evaluations of

@@ -3,21 +3,19 @@
 
 Everywhere below, ``by_task`` is a sequence with an array for each task, whose last axis is the runs
 (seeds); axes before it, the same in all arrays, are kept (evaluations along a curve, say).
-
-python experiments/scores.py --random-returns     # measures RANDOM_RETURNS anew: 7 minutes
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from published_returns import PUBLISHED, ZOO
-from scipy import stats  # type: ignore[import-untyped]
+from scipy import stats
+
+from report.published import PUBLISHED, ZOO
 
 Array = np.ndarray
 
@@ -36,8 +34,7 @@ RANDOM_RETURNS = {
     "Humanoid": 112.6,  # ± 1.0
 }
 """Returns of normalized score 0: uniformly random actions, 1,024 episodes of each task on the
-native engine, measured by ``--random-returns``."""
-RANDOM_EPISODES = 1_024
+native engine, measured by random_returns.py."""
 
 _TRIMMED = 0.25
 _RESAMPLES = 10_000
@@ -160,42 +157,3 @@ def _estimate(
             confidence_level=0.95, rng=np.random.default_rng(0),
         ).confidence_interval  # fmt: skip
     return Estimate(value, interval.low, interval.high)
-
-
-def random_returns(task: str, episodes: int = RANDOM_EPISODES, seed: int = 0) -> Array:
-    """Returns ``[episodes]`` of uniformly random actions on the native engine.
-
-    One episode in each of that many environments, so that short ones do not count more.
-    """
-    import jax
-
-    from sacformer_jax.envs import VectorEnv, make_env
-
-    env = VectorEnv(make_env(task, "native"), episodes)
-    step = jax.jit(lambda state, key: env.step(state, env.random_action(key)))
-    key, init_key = jax.random.split(jax.random.key(seed))
-    state = env.init(init_key)
-    total, running = np.zeros(episodes), np.ones(episodes, bool)
-    while running.any():
-        key, action_key = jax.random.split(key)
-        state, result = step(state, action_key)
-        total += np.where(running, result.reward, 0.0)
-        running &= ~np.asarray(result.done)
-    return total
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints random actions' mean return on each task, with its standard error."""
-    parser = argparse.ArgumentParser(description="What normalized scores are measured against.")
-    parser.add_argument("--random-returns", action="store_true", required=True)
-    parser.add_argument("--tasks", nargs="+", choices=list(REFERENCE_RETURNS), metavar="TASK")
-    parser.add_argument("--episodes", type=int, default=RANDOM_EPISODES)
-    args = parser.parse_args(arguments)
-    for task in args.tasks or REFERENCE_RETURNS:
-        returns = random_returns(task, args.episodes)
-        error = returns.std(ddof=1) / np.sqrt(returns.size)
-        print(f'    "{task}": {returns.mean():.1f},  # ± {error:.1f} (standard error)', flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -16,8 +16,9 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from published_returns import ABOUT, PUBLISHED, ratio_to_cleanrl
-from scores import (
+from report.lines import Line, StudyLines, grouped, label_of
+from report.published import ABOUT, PUBLISHED, ratio_to_cleanrl
+from report.scores import (
     LAST_EVALUATIONS,
     REFERENCE_SOURCE,
     Estimate,
@@ -26,7 +27,6 @@ from scores import (
     normalized,
     probability_of_improvement,
 )
-from study_lines import Line, StudyLines, grouped, label_of
 
 COMPARED_WITH_PUBLISHED = {"baselines"}
 """Studies whose agents are set beside published returns."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from figure_page import make_page, tidy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from report_tables import Aggregate, facts, rated_tasks
-from scores import LAST_EVALUATIONS, REFERENCE_SOURCE, Estimate
-from study_lines import StudyLines, label_of
+
+from report.lines import StudyLines, label_of
+from report.page import make_page, tidy
+from report.scores import LAST_EVALUATIONS, REFERENCE_SOURCE, Estimate
+from report.tables import Aggregate, facts, rated_tasks
 
 _ROW_HEIGHT, _AXIS_HEIGHT = 0.2, 0.55
 _COLOR, _BASELINE_COLOR = "#0b1f66", "#8c8c8c"

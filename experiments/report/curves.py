@@ -9,15 +9,16 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from figure_page import make_page, tidy
-from figure_styles import AGENTS, Style, styles_of
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from report_tables import facts, rated_tasks, unfinished
-from scores import REFERENCE_SOURCE, Estimate, iqm_estimate, mean_estimate, normalized
-from study_lines import Line, StudyLines, label_of
+
+from report.lines import Line, StudyLines, label_of
+from report.page import make_page, tidy
+from report.scores import REFERENCE_SOURCE, Estimate, iqm_estimate, mean_estimate, normalized
+from report.styles import AGENTS, Style, styles_of
+from report.tables import facts, rated_tasks, unfinished
 
 SEEDS_FOR_INTERVAL = 5
 """Seeds from which on a band is a bootstrap interval; of fewer it is their range."""

@@ -1,0 +1,1 @@
+"""What a study's table of evaluations says: scores, statistics, figures, tables."""
