@@ -195,7 +195,9 @@ def _alone_in(folder: RunFolder, do: Callable[[], RunResult]) -> RunResult:
 def _start(population: Population, folder: RunFolder, quiet: bool) -> RunResult:
     config = population.config
     with Reporter(quiet or not is_first()) as reporter:
-        state = population.init()
+        # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
+        # then compile to the same programs, and resuming finds them in the compilation cache.
+        state = jax.device_put(population.init(), population.shardings)
         reporter.facts(population, state, folder.path)
         if population.num_drawable is not None:
             with reporter.timed("compiling and running prefill"):

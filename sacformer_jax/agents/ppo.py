@@ -1,7 +1,7 @@
 """PPO: proximal policy optimization. Schulman et al., arXiv 1707.06347.
 
 The details are those of CleanRL's ``ppo_continuous_action`` (Huang et al., "The 37 Implementation
-Details of Proximal Policy Optimization", 2022); docs/method.md says where they differ.
+Details of Proximal Policy Optimization", 2022); docs/baselines.md says where they differ.
 """
 
 from __future__ import annotations

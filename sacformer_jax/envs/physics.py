@@ -8,6 +8,7 @@ those into observations and rewards.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 from pathlib import Path
 from typing import Any, Protocol, get_args
@@ -16,6 +17,7 @@ import flax.struct
 import jax
 
 from sacformer_jax.config import ConfigError, EngineName, MjxImpl, MjxPreset
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.tasks import Quantities, Task
 
 ENGINES = get_args(EngineName)
@@ -136,6 +138,16 @@ def make_engine(task: Task, choice: EngineChoice) -> Engine:
         from sacformer_jax.envs.mjx_engine import MjxEngine
 
         return MjxEngine(task, choice.mjx_preset, choice.mjx_impl)
+    return _native_engine(task, usable_cores())
+
+
+@functools.cache
+def _native_engine(task: Task, num_threads: int) -> Engine:
+    """The process's engine of a task: pure, so one is enough for all programs.
+
+    What is compiled for one program is then found in the compilation cache by the next one that
+    is the same, since both call the same host functions.
+    """
     from sacformer_jax.envs.native import NativeEngine
 
-    return NativeEngine(task)
+    return NativeEngine(task, num_threads)
