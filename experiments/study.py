@@ -22,7 +22,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import figures
-from study_table import Row, read_table, rows_of, summary, write_table
+from study_rows import rows_of
+from study_table import Row, read_table, summary, write_table
 
 from sacformer_jax import Config, resume, train
 from sacformer_jax.checkpoint import CheckpointError, RunFolder

@@ -1,4 +1,7 @@
-"""The table of a study: a row for each evaluation of each seed, in ``results/STUDY.csv``."""
+"""The table of a study: a row for each evaluation of each seed, in ``results/STUDY.csv``.
+
+Needs no JAX; what makes the rows of a run is in study_rows.py.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sacformer_jax.checkpoint import RunFolder
-from sacformer_jax.logging import read_records
+import numpy as np
+from csv_files import write_csv
+from report.scores import run_scores
 
 COLUMNS = (
     "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
@@ -16,44 +20,6 @@ COLUMNS = (
 )  # fmt: skip
 
 Row = dict[str, Any]
-
-
-def rows_of(study: str, run: str, folder: RunFolder, commits: Sequence[str]) -> list[Row]:
-    """The evaluations in a run's folder, seed by seed; none if it has not begun.
-
-    Args:
-      study: name of the study.
-      run: name of the run.
-      folder: of the run.
-      commits: by which versions of the code it was trained.
-    """
-    if not folder.timings_path.exists():
-        return []
-    seconds, total = {}, 0.0
-    for record in read_records(folder.timings_path):
-        total += record["chunk_seconds"]
-        seconds[record["env_steps"]] = total
-    file = folder.read_config()
-    engine = folder.read_spec().engine
-    return [
-        {
-            "study": study,
-            "run": run,
-            "agent": file.config.agent,
-            "preset": file.config.preset,
-            "env": file.config.task.env,
-            "engine": engine,
-            "seed": member.seed,
-            "env_steps": record["env_steps"],
-            "return_mean": round(record["return_mean"], 2),
-            "return_std": round(record["return_std"], 2),
-            "episodes": record["episodes"],
-            "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
-            "commit": "+".join(commits) or "unknown",
-        }
-        for member in file.members
-        for record in read_records(folder.metrics_path(member.name), "eval")
-    ]
 
 
 def read_table(path: Path) -> list[Row]:
@@ -66,7 +32,6 @@ def read_table(path: Path) -> list[Row]:
                 **row,
                 "env_steps": int(row["env_steps"]),
                 "return_mean": float(row["return_mean"]),
-                "wall_s": float(row["wall_s"]),
             }
             for row in csv.DictReader(file)
         ]
@@ -91,12 +56,7 @@ def write_table(path: Path, new: Mapping[str, Sequence[Row]], order: Sequence[st
     )
     if rows:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        with part.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        part.replace(path)
+        write_csv(path, COLUMNS, rows)
     return rows
 
 
@@ -114,10 +74,10 @@ def summary(rows: Iterable[Row], runs: Iterable[str]) -> str:
         by_seed.setdefault((row["run"], int(row["seed"])), []).append(row)
     for (run, seed), own in by_seed.items():
         if run in wanted:
-            returns = [row["return_mean"] for row in own]
-            last = returns[-5:]
+            returns = np.array([row["return_mean"] for row in own])
             lines.append(
                 f"| {run} | {seed} | {own[-1]['env_steps']:,} | {returns[-1]:.0f} "
-                f"| {sum(last) / len(last):.0f} | {max(returns):.0f} | {own[-1]['wall_s']:,.0f} |"
+                f"| {run_scores(returns):.0f} | {returns.max():.0f} "
+                f"| {float(own[-1]['wall_s']):,.0f} |"
             )
     return "\n".join(lines)

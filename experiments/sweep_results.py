@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import shutil
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from csv_files import write_csv
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -76,16 +76,6 @@ def setting_rows(rows: Sequence[Row], names: Sequence[str]) -> list[Row]:
             }
         )
     return sorted(table, key=lambda row: (math.isnan(row["score"]), -row["score"]))
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a table; at no time is the file there in part."""
-    part = path.with_suffix(".part")
-    with part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    part.replace(path)
 
 
 def print_table(table: Sequence[Row]) -> None:
@@ -162,8 +152,8 @@ def report(folder: RunFolder, members: Sequence[Member]) -> list[Row]:
     names = list(members[0].values)
     rows = [member_row(each, read_records(folder.metrics_path(each.name))) for each in members]
     table = setting_rows(rows, names)
-    write_csv(folder.path / "sweep.csv", rows)
-    write_csv(folder.path / "sweep_settings.csv", table)
+    write_csv(folder.path / "sweep.csv", list(rows[0]), rows)
+    write_csv(folder.path / "sweep_settings.csv", list(table[0]), table)
     picture(rows, table, names, folder.path / "sweep.png")
     print_table(table)
     print(f"tables and picture: {folder.path}/sweep.csv, sweep_settings.csv, sweep.png")

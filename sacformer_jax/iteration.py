@@ -95,17 +95,17 @@ class TrainingFunctions:
         context_length = self.config.context.context_length
         return rollout.start(self.env, self.buffer, context_length, cache, key)
 
+    def _exploring(self, policy: PolicyState) -> rollout.ChooseAction:
+        return lambda context, key: self.agent.act(policy, context, key, explore=True)
+
     def refill(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, env_key = jax.random.split(state.key)
-        start, policy = self._start(env_key), policy_of(state)
+        start, exploring = self._start(env_key), self._exploring(policy_of(state))
         state = dataclasses.replace(
             state, env=start.env, context=start.context, buffer=start.buffer, key=key
         )
 
-        def choose_action(context: Context, key: jax.Array) -> Acted:
-            return self.agent.act(policy, context, key, explore=True)
-
-        state, stats, _ = self._collect(state, choose_action, self.config.prefill_vector_steps)
+        state, stats, _ = self._collect(state, exploring, self.config.prefill_vector_steps)
         return state, stats.metrics()
 
     def prefill(self, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -135,11 +135,8 @@ class TrainingFunctions:
         """Collects, then updates; metrics lead with the update axis."""
         num_steps, num_updates = self.config.steps_and_updates
         policy = policy_of(state)
-
-        def choose_action(context: Context, key: jax.Array) -> Acted:
-            return self.agent.act(policy, context, key, explore=True)
-
-        state, stats, steps = self._collect(state, choose_action, num_steps)
+        exploring = self._exploring(policy)
+        state, stats, steps = self._collect(state, exploring, num_steps)
         key, updates_key = jax.random.split(state.key)
         if isinstance(self.learning, ReplayLearning):
             state, metrics, done = self.learning.learn(state, updates_key, num_updates)

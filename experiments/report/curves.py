@@ -201,7 +201,9 @@ def _caption(study: StudyLines, averages: dict[str, _Curve]) -> str:
         text += " Bands: lowest to highest seed."
     if any(number >= SEEDS_FOR_INTERVAL for number in seeds):
         text += " Bands: 95 % bootstrap interval of the mean"
-        text += f" (of {SEEDS_FOR_INTERVAL} seeds or more)." if min(seeds) < 5 else "."
+        text += (
+            f" (of {SEEDS_FOR_INTERVAL} seeds or more)." if min(seeds) < SEEDS_FOR_INTERVAL else "."
+        )
     if averages:
         text += (
             f" {_AVERAGE}: interquartile mean of normalized scores of all runs "

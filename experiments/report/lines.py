@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from study_table import read_table
 
 from report.scores import REFERENCE_RETURNS, run_scores, variant_of
 
@@ -131,14 +132,13 @@ def is_study_table(path: Path) -> bool:
 
 def read_study(path: Path) -> StudyLines | None:
     """The lines of ``results/STUDY.csv``; None if it has no rows."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_table(path)
     lines: dict[tuple[str, str], Line] = {}
     for row in rows:
         task, variant = row["env"], variant_of(row)
         line = lines.setdefault((task, variant), Line(task, variant, row["agent"]))
         curve = line.curves.setdefault(int(row["seed"]), {})
-        curve[int(row["env_steps"])] = float(row["return_mean"])
+        curve[row["env_steps"]] = row["return_mean"]
     if not lines:
         return None
     known = list(REFERENCE_RETURNS)

@@ -8,17 +8,37 @@ from typing import Any, Protocol
 import flax.struct
 import jax
 
+from sacformer_jax import normalizer
+from sacformer_jax.parallel import DataAxis
 from sacformer_jax.types import (
     Acted,
     Cache,
     Context,
     Hyperparameters,
     LearnerState,
+    Normalizer,
     PolicyState,
     Rollout,
 )
 
 Metrics = dict[str, jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentParts:
+    """What the static parts of every agent have.
+
+    Attributes:
+      normalize_obs: use the running observation statistics.
+      data: how environments and batches are split over devices.
+    """
+
+    normalize_obs: bool
+    data: DataAxis
+
+    def normalized(self, statistics: Normalizer, obs: jax.Array) -> jax.Array:
+        """Observations as the networks see them."""
+        return normalizer.normalize(statistics, obs) if self.normalize_obs else obs
 
 
 class Act(Protocol):

@@ -27,7 +27,6 @@ from sacformer_jax.agents.off_policy import (
     OffPolicyParts,
     StepWeights,
     init_critics,
-    prepare_obs,
     soft_update,
     step_actor,
     step_critics,
@@ -143,7 +142,7 @@ def _act(
 ) -> Acted:
     """``μ(s)``, in exploring plus Gaussian noise, within the bounds."""
     mean: Any = parts.actor.apply(
-        policy.actor_params, prepare_obs(parts, policy, context.obs[:, -1])
+        policy.actor_params, parts.normalized(policy.normalizer, context.obs[:, -1])
     )
     if explore:
         action = _noisy(parts.exploration, parts.data.normal(key, mean.shape), mean)
@@ -167,7 +166,7 @@ def _update(
     window: Window,
     key: jax.Array,
 ) -> tuple[LearnerState, Metrics]:
-    obs = prepare_obs(parts, learner, window.obs)
+    obs = parts.normalized(learner.normalizer, window.obs)
     inputs = CriticInputs(
         obs[:, :-1], obs[:, 1:], window.action, window.time_step, window.state_mask
     )

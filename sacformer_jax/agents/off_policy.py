@@ -15,12 +15,10 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sacformer_jax import normalizer
-from sacformer_jax.agents.core import Metrics
+from sacformer_jax.agents.core import AgentParts, Metrics
 from sacformer_jax.agents.faults import adam_where, first_fault, num_non_finite
 from sacformer_jax.critics import CriticInputs, Critics
-from sacformer_jax.parallel import DataAxis
-from sacformer_jax.types import Hyperparameters, LearnerState, Params, PolicyState, Window
+from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
 ADAM = optax.scale_by_adam()
 
@@ -32,7 +30,7 @@ CHECKED = (
 
 
 @dataclasses.dataclass(frozen=True)
-class OffPolicyParts:
+class OffPolicyParts(AgentParts):
     """The static parts of an update.
 
     Attributes:
@@ -41,8 +39,6 @@ class OffPolicyParts:
       obs_size: O.
       action_size: A.
       context_length: K.
-      normalize_obs: use the running observation statistics.
-      data: how environments and batches are split over devices.
     """
 
     actor: nn.Module
@@ -50,17 +46,6 @@ class OffPolicyParts:
     obs_size: int
     action_size: int
     context_length: int
-    normalize_obs: bool
-    data: DataAxis
-
-
-def prepare_obs(
-    parts: OffPolicyParts, learner_or_policy: LearnerState | PolicyState, obs: jax.Array
-) -> jax.Array:
-    """Observations as the networks see them."""
-    if parts.normalize_obs:
-        return normalizer.normalize(learner_or_policy.normalizer, obs)
-    return obs
 
 
 def init_critics(parts: OffPolicyParts, key: jax.Array) -> Params:

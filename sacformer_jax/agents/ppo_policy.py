@@ -14,13 +14,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax import normalizer
+from sacformer_jax.agents.core import AgentParts
 from sacformer_jax.config import PpoConfig
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.layers import Dense
 from sacformer_jax.networks import MLP, GaussianParams
-from sacformer_jax.parallel import DataAxis
-from sacformer_jax.types import Acted, Context, Normalizer, Params, PolicyState
+from sacformer_jax.types import Acted, Context, Params, PolicyState
 
 
 class PpoActor(nn.Module):
@@ -79,7 +78,7 @@ def entropy(gaussian: GaussianParams) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class PpoParts:
+class PpoParts(AgentParts):
     """The static parts.
 
     Attributes:
@@ -88,8 +87,6 @@ class PpoParts:
       settings: the configuration's section.
       num_rounds: rounds of learning in the run.
       spec: facts of the environment.
-      normalize_obs: use the running observation statistics.
-      data: how environments and minibatches are split over devices.
     """
 
     actor: PpoActor
@@ -97,8 +94,6 @@ class PpoParts:
     settings: PpoConfig
     num_rounds: int
     spec: EnvSpec
-    normalize_obs: bool
-    data: DataAxis
 
     def policy(self, params: Params, obs: jax.Array) -> GaussianParams:
         gaussian: Any = self.actor.apply(params, obs)
@@ -107,10 +102,6 @@ class PpoParts:
     def value(self, params: Params, obs: jax.Array) -> jax.Array:
         value: Any = self.critic.apply(params, obs)
         return value
-
-    def normalized(self, statistics: Normalizer, obs: jax.Array) -> jax.Array:
-        """Observations as the networks see them."""
-        return normalizer.normalize(statistics, obs) if self.normalize_obs else obs
 
 
 def act(

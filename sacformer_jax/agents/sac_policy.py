@@ -12,7 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax.agents.off_policy import OffPolicyParts, prepare_obs
+from sacformer_jax.agents.off_policy import OffPolicyParts
 from sacformer_jax.config import Conditioning, Config
 from sacformer_jax.context import commanded_return_to_go
 from sacformer_jax.critics import make_critics
@@ -128,7 +128,7 @@ def act(
         return_to_go = jnp.zeros_like(return_to_go)
     output: Any = parts.acting_actor.apply(
         {**policy.actor_params, "cache": context.cache},
-        prepare_obs(parts, policy, context.obs),
+        parts.normalized(policy.normalizer, context.obs),
         context.action,
         return_to_go,
         context.time_step,
@@ -196,7 +196,7 @@ def window_policies(
     ) -> ActorOutput:
         output: Any = parts.actor.apply(
             actor_params,
-            prepare_obs(parts, learner, states.obs),
+            parts.normalized(learner.normalizer, states.obs),
             action,
             states.return_to_go,
             states.time_step,

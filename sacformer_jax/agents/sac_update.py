@@ -22,7 +22,6 @@ from sacformer_jax.agents.off_policy import (
     Backup,
     StepWeights,
     init_critics,
-    prepare_obs,
     soft_update,
     step_actor,
     step_critics,
@@ -128,11 +127,11 @@ def _alpha(learner: LearnerState) -> jax.Array:
 
 
 def _critic_inputs(parts: SACParts, learner: LearnerState, window: Window) -> CriticInputs:
-    obs = prepare_obs(parts, learner, window.obs)
+    obs = parts.normalized(learner.normalizer, window.obs)
     if window.following is None:
         now, following = obs[:, :-1], obs[:, 1:]
     else:
-        now, following = obs, prepare_obs(parts, learner, window.following.obs)
+        now, following = obs, parts.normalized(learner.normalizer, window.following.obs)
     return CriticInputs(now, following, window.action, window.time_step, window.state_mask)
 
 
