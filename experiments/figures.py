@@ -18,6 +18,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from report.curves import grid_figure, panels_figure
 from report.intervals import intervals_figure
 from report.lines import is_study_table, read_study
@@ -71,11 +72,25 @@ def draw(table: Path, baseline: str | None = None) -> list[Path]:
 def _save(figure: Figure, stem: Path) -> list[Path]:
     """As PNG and SVG, without anything that differs from time to time."""
     FigureCanvasAgg(figure)
+    _settle(figure)
     png, svg = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.svg")
     figure.savefig(png, dpi=_DPI, metadata={"Software": None})
     with matplotlib.rc_context({"svg.hashsalt": stem.name}):
         figure.savefig(svg, metadata={"Date": None, "Creator": None})
     return [png, svg]
+
+
+def _settle(figure: Figure) -> None:
+    """Lays the figure out for good, with panels at rounded places.
+
+    The last bits of what the layout's solver finds differ from time to time, and names in an SVG
+    are made of them.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        rounded = (round(number, 6) for number in axes.get_position().bounds)
+        axes.set_position(Bbox.from_bounds(*rounded))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
