@@ -5,9 +5,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from bench.peer_programs import ours
 from bench.peer_programs.host import PeerError, Program, ensure_venv
 from bench.peer_programs.protocol import Setting
-from bench.peers import ENVIRONMENT, PEERS, compare, requirements
+from bench.peers import CASES, ENVIRONMENT, PEERS, compare, requirements
 
 SETTING = Setting("sac", "HalfCheetah", stretch_steps=100, cores=2)
 
@@ -118,6 +119,23 @@ def test_environment_is_made_only_when_its_packages_change(tmp_path):
 
 def test_every_peer_has_its_program_and_environment():
     folder = Path(ENVIRONMENT["PYTHONPATH"]) / "bench" / "peer_programs"
-    for peer in (peer for peers in PEERS.values() for peer in peers.values()):
+    for peer in PEERS.values():
         assert (folder / f"{peer.module}.py").is_file()
         assert peer.venv is None or peer.venv in requirements()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_case_is_our_preset_and_has_known_peers(name):
+    case = CASES[name]
+    assert set(case.peers) < set(PEERS)
+    setting = case.setting()
+    made = ours.config(setting)  # asserts that the preset has the setting's values
+    assert made.agent == setting.agent
+    if setting.agent == "ppo":  # a stretch is whole rollouts
+        assert setting.stretch_steps % (setting.num_envs * setting.rollout_steps) == 0
+
+
+def test_setting_that_is_not_our_preset_is_noticed():
+    setting = Setting("td3", "HalfCheetah", stretch_steps=100, cores=2, policy_delay=3)
+    with pytest.raises(AssertionError):
+        ours.config(setting)

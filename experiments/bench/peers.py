@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from bench.clock import Clock
 from bench.peer_programs.host import Answer, PeerError, Program, ensure_venv, tell
@@ -25,8 +26,6 @@ ROOT = Path(__file__).resolve().parents[2]
 VENVS = ROOT / ".venv-peers"
 ENVIRONMENT = {"PYTHONPATH": str(ROOT / "experiments"), "JAX_PLATFORMS": "cpu"}
 ENV = "HalfCheetah"
-ROUNDS = 9
-STRETCH_STEPS = 500
 LIMIT_SECONDS = 240.0
 
 
@@ -86,22 +85,61 @@ class Peer:
         return Program(command, ENVIRONMENT, LIMIT_SECONDS)
 
 
-PEERS: dict[str, dict[str, Peer]] = {
-    "sac": {
-        "sbx": Peer("stable_baselines", "stable_baselines", ("sbx",)),
-        "sb3": Peer("stable_baselines", "stable_baselines", ("sb3",)),
-        "brax": Peer("brax_training", "brax"),
-        "rejax": Peer("rejax_algorithms", "rejax"),
-        "ours": Peer("ours", None),
-    },
+PEERS: dict[str, Peer] = {
+    "sbx": Peer("stable_baselines", "stable_baselines", ("sbx",)),
+    "sb3": Peer("stable_baselines", "stable_baselines", ("sb3",)),
+    "brax": Peer("brax_training", "brax"),
+    "rejax": Peer("rejax_algorithms", "rejax"),
+    "ours": Peer("ours", None),
 }
-"""By agent; one more needs its line here and its name in the programs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """An agent, at our preset `paper` or with more environments, and who else has it.
+
+    Attributes:
+      agent: the algorithm.
+      peers: keys of :data:`PEERS`, besides ours.
+      rounds: stretches of each.
+      stretch_steps: environment steps of one; of PPO whole rollouts.
+      fields: of the setting, other than its defaults.
+    """
+
+    agent: str
+    peers: tuple[str, ...]
+    rounds: int
+    stretch_steps: int = 500
+    fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def setting(self) -> Setting:
+        """What its programs are told."""
+        return Setting(self.agent, ENV, self.stretch_steps, usable_cores(), **self.fields)
+
+
+PPO = {"hidden_layers": (64, 64), "activation": "tanh", "learning_starts": 0}
+
+CASES: dict[str, Case] = {
+    "sac": Case("sac", ("sbx", "sb3", "brax", "rejax"), rounds=9),
+    "td3": Case("td3", ("sbx", "sb3", "rejax"), rounds=7),
+    "ddpg": Case("ddpg", ("sbx", "sb3"), rounds=7),
+    "ppo": Case("ppo", ("sbx", "sb3", "brax", "rejax"), 7, 2 * 2_048, PPO),
+    "ppo64": Case(
+        "ppo",
+        ("sbx", "sb3", "brax", "rejax"),
+        7,
+        2 * 64 * 128,
+        {**PPO, "num_envs": 64, "rollout_steps": 128},
+    ),
+}
+"""By the name in the keys. JAX peers are made for many environments, hence ``ppo64``: 64 of them
+make 128 steps each, and the 32 minibatches are of 256 samples instead of 64."""
 
 Start = Callable[[], Program]
 
 
-def measure(clock: Clock, agent: str = "sac") -> dict[str, float | str]:
-    """All peers by flat keys ``peer.AGENT.NAME.WHAT``.
+def measure(clock: Clock) -> dict[str, float | str]:
+    """All cases by flat keys ``peer.CASE.NAME.WHAT``.
 
     ``steps_per_s`` is the median over the stretches, in environment steps per second of training;
     ``steps_per_s_min`` and ``_max`` are the slowest and the fastest stretch;
@@ -109,9 +147,12 @@ def measure(clock: Clock, agent: str = "sac") -> dict[str, float | str]:
     work; ``version`` is the library's and ``jax_version``, ``torch_version`` are those below it.
     """
     del clock  # steps per second of programs that take turns: their ratios are what holds
-    setting = Setting(agent, ENV, STRETCH_STEPS, usable_cores())
-    starts = {name: partial(peer.start, setting) for name, peer in PEERS[agent].items()}
-    return compare(starts, f"peer.{agent}", ROUNDS)
+    results: dict[str, float | str] = {}
+    for name, case in CASES.items():
+        setting = case.setting()
+        starts = {peer: partial(PEERS[peer].start, setting) for peer in (*case.peers, "ours")}
+        results |= compare(starts, f"peer.{name}", case.rounds)
+    return results
 
 
 def compare(starts: Mapping[str, Start], prefix: str, rounds: int) -> dict[str, float | str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import jax
 
@@ -11,7 +12,8 @@ from sacformer_jax import Config, make_program
 
 
 def config(setting: Setting) -> Config:
-    """Preset `paper`, whose values for SAC must be those of the setting."""
+    """Preset `paper`, whose values for the agent must be those of the setting."""
+    of_rollout = {"num_envs": setting.num_envs, "rollout_steps": setting.rollout_steps}
     made = Config.from_preset(
         "paper",
         agent=setting.agent,
@@ -20,26 +22,38 @@ def config(setting: Setting) -> Config:
         seed=setting.seed,
         prefill_env_steps=setting.learning_starts,
         chunk_env_steps=setting.stretch_steps,
+        **(of_rollout if setting.agent == "ppo" else {}),
     )
-    expected = {
-        "num_envs": setting.num_envs,
-        "updates_per_env_step": setting.updates_per_env_step,
-        "batch_size": setting.batch_size,
-        "buffer_capacity": setting.buffer_capacity,
-        "max_episode_steps": setting.max_episode_steps,
-        "actor_learning_rate": setting.learning_rate,
-        "critic_learning_rate": setting.learning_rate,
-        "discount": setting.discount,
-        "tau": setting.tau,
-        "tune_alpha": True,
-        "normalize_obs": False,
-    }
-    values = made.flat()
+    values, expected = made.flat(), _expected(setting)
     assert {name: values[name] for name in expected} == expected
     for network in ("actor", "critic"):
         width, layers = values[f"{network}_width"], values[f"{network}_layers"]
         assert (width,) * layers == setting.hidden_layers
     return made
+
+
+def _expected(setting: Setting) -> dict[str, Any]:
+    """What the setting says, by our names."""
+    same_names = ["num_envs", "max_episode_steps", "discount"]
+    expected: dict[str, Any] = {
+        "actor_learning_rate": setting.learning_rate,
+        "critic_learning_rate": setting.learning_rate,
+        "actor_activation": setting.activation,
+        "critic_activation": setting.activation,
+        "normalize_obs": setting.agent == "ppo",
+        "tune_alpha": setting.agent == "sac",
+    }
+    if setting.agent == "ppo":
+        same_names += ["rollout_steps", "epochs", "minibatches", "gae_lambda", "clip_range"]
+        same_names += ["value_coefficient", "max_grad_norm"]
+        expected |= {"entropy_coefficient": 0.0, "clip_value_loss": True, "normalize_reward": True}
+    else:
+        same_names += ["updates_per_env_step", "batch_size", "buffer_capacity", "tau"]
+    if setting.agent in ("td3", "ddpg"):
+        same_names += ["action_noise"]
+    if setting.agent == "td3":
+        same_names += ["policy_delay", "target_noise", "target_noise_clip"]
+    return expected | {name: getattr(setting, name) for name in same_names}
 
 
 def main() -> None:

@@ -26,15 +26,23 @@ STRETCH = {"do": "stretch"}
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What every peer trains; the networks are ReLU MLPs, and all of it is float32.
+    """What every peer trains; the networks are MLPs, and all of it is float32.
 
     Attributes:
-      agent: the algorithm.
+      agent: the algorithm: sac, td3, ddpg or ppo.
       env: the MuJoCo task, as named here and, with ``-v5``, by Gymnasium.
       stretch_steps: environment steps of a stretch.
       cores: threads a library may use, if it asks.
+      hidden_layers: of the actor and of each critic.
+      activation: after each of them, ``relu`` or ``tanh``.
+      updates_per_env_step: of agents with a replay, as is all up to ``tau``.
       learning_starts: environment steps before the first update.
       buffer_capacity: environment steps the replay holds.
+      action_noise: of TD3 and DDPG in acting, over half the action range.
+      policy_delay: TD3's updates of the critics to one of the actor and of the targets.
+      rollout_steps: PPO's of each environment between two rounds; what follows is PPO's, too.
+      epochs: passes over a rollout.
+      minibatches: parts of a pass, an update each.
     """
 
     agent: str
@@ -42,16 +50,33 @@ class Setting:
     stretch_steps: int
     cores: int
     num_envs: int = 1
-    updates_per_env_step: int = 1
-    batch_size: int = 256
     hidden_layers: tuple[int, ...] = (256, 256)
-    learning_starts: int = 1_000
-    buffer_capacity: int = 1_000_000
+    activation: str = "relu"
     max_episode_steps: int = 1_000
     learning_rate: float = 3e-4
     discount: float = 0.99
-    tau: float = 0.005
     seed: int = 0
+    updates_per_env_step: int = 1
+    batch_size: int = 256
+    learning_starts: int = 1_000
+    buffer_capacity: int = 1_000_000
+    tau: float = 0.005
+    action_noise: float = 0.1
+    policy_delay: int = 2
+    target_noise: float = 0.2
+    target_noise_clip: float = 0.5
+    rollout_steps: int = 2_048
+    epochs: int = 10
+    minibatches: int = 32
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    value_coefficient: float = 0.5
+    max_grad_norm: float = 0.5
+
+    @property
+    def minibatch_size(self) -> int:
+        """Samples of an update of PPO."""
+        return self.num_envs * self.rollout_steps // self.minibatches
 
     def to_json(self) -> str:
         """As a program gets it."""
