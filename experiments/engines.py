@@ -24,7 +24,8 @@ import numpy as np
 from sacformer_jax.envs import TASKS, VectorEnv, make_env, mjx_engine
 from sacformer_jax.envs.mjx_engine import MjxEngine, SolverIterations
 from sacformer_jax.envs.mujoco_env import MujocoEnv
-from sacformer_jax.envs.native import STATE_SPEC, NativeEngine
+from sacformer_jax.envs.native import NativeEngine
+from sacformer_jax.envs.native_host import STATE_SPEC
 from sacformer_jax.envs.physics import EngineChoice
 
 RESULTS = Path(__file__).parent / "results" / "engines.json"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +85,8 @@ class RolloutLearning:
 
         The P of an epoch have every step once.
         """
-        keys = jax.random.split(self.data.own_key(key), self.epochs)
-        order: Any = jax.vmap(lambda key: jax.random.permutation(key, num))(keys)  # [E, num]
+        # Sorted by one draw of 32 bits each: twice as fast as jax.random.permutation, which sorts
+        # again to part the few that are equal.
+        bits = jax.random.bits(self.data.own_key(key), (self.epochs, num))
+        order = jnp.argsort(bits, axis=-1).astype(jnp.int32)  # [E, num]
         return order.reshape(self.epochs * self.minibatches, -1)

@@ -304,7 +304,7 @@ def test_a_batch_is_shared_between_threads(ant, monkeypatch):
 
 def test_little_work_and_a_busy_pool_stay_on_the_calling_thread(ant, monkeypatch):
     step, expected = jax.vmap(ant.engine.step), ant.batched(ant.states, ant.actions)
-    expected = jax.tree.map(lambda x: x[0, 0], expected)
+    expected = jax.block_until_ready(jax.tree.map(lambda x: x[0, 0], expected))
     pool = ant.engine.threads.pool
     submitted, submit = [], pool.submit
     monkeypatch.setattr(
@@ -360,7 +360,7 @@ def test_an_exception_in_a_thread_surfaces_when_none_works_any_more(ant, monkeyp
         step(worker, *args)
         ended.append(worker)
 
-    expected = ant.batched(ant.states, ant.actions[:1])
+    expected = jax.block_until_ready(ant.batched(ant.states, ant.actions[:1]))
     with monkeypatch.context() as patched:
         patched.setattr(Worker, "step", breaking)
         with pytest.raises(Exception, match="ValueError: this one breaks"):
@@ -375,6 +375,7 @@ def test_a_helper_left_by_an_interrupted_call_keeps_its_mjdata(ant, monkeypatch)
     engine = NativeEngine(TASKS["Ant"], num_threads=3)
     batched = jax.vmap(jax.vmap(engine.step))
     expected = jax.tree.map(lambda x: x[0], ant.batched(ant.states, ant.actions))
+    jax.block_until_ready(expected)
     step, left, released = Worker.step, threading.Event(), threading.Event()
 
     def slow(worker, *args):

@@ -10,6 +10,7 @@ time.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import flax.struct
@@ -86,9 +87,13 @@ class Env(Protocol):
         actions: jax.Array,
         refill: jax.Array,
         prepared: tuple[Any, jax.Array],
-        keys: jax.Array,
+        keys: Callable[[], jax.Array],
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
-        """Steps N environments and renews the prepared resets where ``refill [N]`` is true."""
+        """Steps N environments and renews the prepared resets where ``refill [N]`` is true.
+
+        ``keys()`` makes a key for each, ``[N]``; it is called where they are needed, so that a step
+        in which nothing is to be refilled need not make them.
+        """
         ...
 
 
@@ -119,14 +124,23 @@ class JaxEnv:
         actions: jax.Array,
         refill: jax.Array,
         prepared: tuple[Any, jax.Array],
-        keys: jax.Array,
+        keys: Callable[[], jax.Array],
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
         prepared = jax.lax.cond(
             any_of_all(refill),
-            lambda: where_tree(refill, jax.vmap(self.reset)(keys), prepared),
+            lambda: where_tree(refill, jax.vmap(self.reset)(keys()), prepared),
             lambda: prepared,
         )
         return jax.vmap(self.step)(states, actions), prepared
+
+
+def _successor(key: jax.Array) -> jax.Array:
+    """The key after this one, as a counter counts: in a loop on the CPU, hashing even one key takes
+    longer than all else a step needs beside the physics. What threefry makes of neighbours is
+    unrelated.
+    """
+    words = jax.random.key_data(key)
+    return jax.random.wrap_key_data(words.at[..., -1].add(1), impl=jax.random.key_impl(key))
 
 
 @flax.struct.dataclass
@@ -233,10 +247,8 @@ class VectorEnv:
 
     def step(self, state: VectorEnvState, action: jax.Array) -> tuple[VectorEnvState, VectorStep]:
         """Steps all environments under ``action [N, A]`` and resets those that finished."""
-        # One split: on CPU each costs more than the numbers it makes.
-        keys = jax.random.split(state.key, 1 + self.num_envs * self.data.size)
         (env_state, step), prepared = self.env.step_and_refill(
-            state.env, action, state.refill, state.prepared, self.data.rows(keys[1:])
+            state.env, action, state.refill, state.prepared, lambda: self._keys(state.key)
         )
         bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
         time_step = state.time_step + 1
@@ -251,7 +263,7 @@ class VectorEnv:
             time_step=jnp.where(done, 0, time_step),
             prepared=prepared,
             refill=done,
-            key=keys[0],
+            key=_successor(state.key),
         )
         return next_state, VectorStep(
             obs=obs,

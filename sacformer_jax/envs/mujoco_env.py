@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
 from sacformer_jax.envs.physics import EngineChoice, PhysicsOutput, ResetNoise, make_engine
 from sacformer_jax.envs.tasks import TASKS
+from sacformer_jax.parallel import any_of_all
 
 
 class MujocoEnv:
@@ -56,11 +58,17 @@ class MujocoEnv:
         actions: jax.Array,
         refill: jax.Array,
         prepared: tuple[Any, jax.Array],
-        keys: jax.Array,
+        keys: Callable[[], jax.Array],
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
-        stepped, fresh = self.engine.step_and_reset(
-            states, actions, refill, jax.vmap(self.reset_noise)(keys)
-        )
+        def draw() -> ResetNoise:
+            noise: ResetNoise = jax.vmap(self.reset_noise)(keys())
+            return noise
+
+        def none() -> ResetNoise:
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(draw))
+
+        noise = jax.lax.cond(any_of_all(refill), draw, none)
+        stepped, fresh = self.engine.step_and_reset(states, actions, refill, noise)
         fresh_obs = jax.vmap(self.task.observe)(fresh.quantities)
         steps = jax.vmap(self._env_step)(stepped, actions)
         return (stepped.state, steps), where_tree(refill, (fresh.state, fresh_obs), prepared)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,7 +27,7 @@ import numpy as np
 
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.host_call import HostCall
-from sacformer_jax.envs.native_host import STATE_SPEC, Job, Layout, Outputs, Threads, Worker
+from sacformer_jax.envs.native_host import Job, Layout, Outputs, Threads, Worker
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, model_path
 from sacformer_jax.envs.tasks import Quantities, Task
 
@@ -81,8 +82,6 @@ class NativeEngine:
         self.num_threads = num_threads or usable_cores()
         self.threads = Threads(self.model, task, self.num_threads)
         self._layout = Layout.of(self.model, task)
-        self._num_physics = mujoco.mj_stateSize(self.model, STATE_SPEC)
-        self._num_words = 2 * (self._num_physics + 2)
         runge_kutta = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         number = next(_NUMBERS[task.name])
         self._host_calls = {
@@ -103,10 +102,12 @@ class NativeEngine:
     # --- pure functions of one environment ---------------------------------------------------
 
     def reset(self, noise: ResetNoise) -> PhysicsOutput:
-        return self._unpack(*self._call("reset", 1, noise.qpos, noise.qvel))
+        (fresh,) = self._call("reset", 1, noise.qpos, noise.qvel)
+        return fresh
 
     def step(self, state: jax.Array, ctrl: jax.Array) -> PhysicsOutput:
-        return self._unpack(*self._call("step", 1, state, ctrl))
+        (stepped,) = self._call("step", 1, state, ctrl)
+        return stepped
 
     def step_and_reset(
         self, states: jax.Array, ctrls: jax.Array, reset: jax.Array, noise: ResetNoise
@@ -116,10 +117,8 @@ class NativeEngine:
     def _step_and_reset(
         self, state: jax.Array, ctrl: jax.Array, reset: jax.Array, noise: ResetNoise
     ) -> tuple[PhysicsOutput, PhysicsOutput]:
-        words, row, fresh_words, fresh_row = self._call(
-            "step_and_reset", 2, state, ctrl, noise.qpos, noise.qvel, reset
-        )
-        return self._unpack(words, row), self._unpack(fresh_words, fresh_row)
+        stepped, fresh = self._call("step_and_reset", 2, state, ctrl, noise.qpos, noise.qvel, reset)
+        return stepped, fresh
 
     def pack_state(self, physics: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """Host helper: MuJoCo's state vector and measured xy (float64) as the state's words."""
@@ -130,15 +129,16 @@ class NativeEngine:
         state = np.ascontiguousarray(np.asarray(words)).view(np.float64)
         return state[..., :-2], state[..., -2:]
 
-    def _call(self, host_call: str, outputs: int, *parts: jax.Array) -> Any:
-        result = (
-            jax.ShapeDtypeStruct((self._num_words,), jnp.uint32),
-            jax.ShapeDtypeStruct((self._layout.size,), jnp.float32),
-        )
+    def _call(self, host_call: str, outputs: int, *parts: jax.Array) -> list[PhysicsOutput]:
+        num_words = 2 * self._layout.columns
+        result = jax.ShapeDtypeStruct((outputs * num_words,), jnp.uint32)
         operand = jnp.concatenate([_as_words(part) for part in parts])
-        return self._host_calls[host_call](result * outputs, operand)
+        (words,) = self._host_calls[host_call]((result,), operand)
+        return [self._unpack(words[i * num_words :]) for i in range(outputs)]
 
-    def _unpack(self, words: jax.Array, row: jax.Array) -> PhysicsOutput:
+    def _unpack(self, words: jax.Array) -> PhysicsOutput:
+        num_state, size = self._layout.num_state_words, self._layout.size
+        row = jax.lax.bitcast_convert_type(words[num_state : num_state + size], jnp.float32)
         values = self._layout.unpack(row)
         quantities = Quantities(
             qpos=values["qpos"],
@@ -146,61 +146,64 @@ class NativeEngine:
             displacement=values["displacement"],
             derived={name: values[name] for name in self.task.derived},
         )
-        return PhysicsOutput(state=words, quantities=quantities, bad=values["bad"] > 0.5)
+        state = words[:num_state]
+        return PhysicsOutput(state=state, quantities=quantities, bad=values["bad"] > 0.5)
 
     # --- the host call: NumPy only -----------------------------------------------------------
 
-    def _host_step(self, operand: Any) -> tuple[np.ndarray, ...]:
-        operand = np.asarray(operand)
-        return self._host(operand, np.zeros(operand.shape[:-1], bool))[:2]
+    def _host_step(self, operand: Any) -> tuple[np.ndarray]:
+        return self._host(np.asarray(operand), steps=True, resets=None)
 
-    def _host_reset(self, operand: Any) -> tuple[np.ndarray, ...]:
+    def _host_reset(self, operand: Any) -> tuple[np.ndarray]:
         operand = np.asarray(operand)
-        return self._host(operand, np.ones(operand.shape[:-1], bool), steps=False)[2:]
+        return self._host(operand, steps=False, resets=np.ones(operand.shape[:-1], bool))
 
-    def _host_step_and_reset(self, operand: Any) -> tuple[np.ndarray, ...]:
+    def _host_step_and_reset(self, operand: Any) -> tuple[np.ndarray]:
         operand = np.asarray(operand)
-        return self._host(operand, operand[..., -1] != 0)
+        return self._host(operand, steps=True, resets=operand[..., -1] != 0)
 
     def _host(
-        self, operand: np.ndarray, resets: np.ndarray, steps: bool = True
-    ) -> tuple[np.ndarray, ...]:
+        self, operand: np.ndarray, *, steps: bool, resets: np.ndarray | None
+    ) -> tuple[np.ndarray]:
         """All environments, of any leading shape.
 
         Args:
           operand: ``[..., words]`` uint32: state and control if ``steps``, then the noise of qpos
             and qvel if there are ``resets``; what follows is not looked at.
-          resets: ``[...]`` bool, which environments get a fresh episode.
           steps: whether to step all.
+          resets: ``[...]`` bool, which environments get a fresh episode.
 
         Returns:
-          States ``[..., words of a state]`` uint32 and rows ``[..., layout.size]`` float32 after
-          the step, and both of the fresh episodes; zeros where nothing was asked for.
+          ``[..., words]`` uint32, by :class:`Layout`: after the step, then of the fresh episode,
+          as far as asked for; zeros where an environment gets none.
         """
-        num, nq, nu, num_physics = resets.size, self.nq, self.model.nu, self._num_physics
-        words, chosen = operand.reshape(num, operand.shape[-1]), np.flatnonzero(resets).tolist()
-        stepped, fresh = (Outputs(num, num_physics, self._layout) for _ in range(2))
+        layout, model = self._layout, self.model
+        leading = operand.shape[:-1]
+        words = operand.reshape(math.prod(leading), operand.shape[-1])
+        columns, num_physics = layout.columns, layout.num_physics
+        numbers = np.zeros((len(words), columns * (steps + (resets is not None))))
+        stepped = fresh = None
         jobs: list[Job] = []
         if steps:
-            state = words[:, : self._num_words].view(np.float64)
-            words = words[:, self._num_words :]
-            inputs = np.empty((num, num_physics + nu))
+            stepped = Outputs(numbers[:, :columns], layout)
+            state = words[:, : layout.num_state_words].view(np.float64)
+            words = words[:, layout.num_state_words :]
+            inputs = np.empty((len(words), num_physics + model.nu))
             inputs[:, :num_physics] = state[:, :num_physics]
-            inputs[:, num_physics:] = words[:, :nu].view(np.float32)
-            words = words[:, nu:]
-            stepped.prepare(self.task, self.model, self._layout)
-            jobs.append(Job(Worker.step, inputs, stepped, range(num), self._step_work))
-        if chosen:
-            noise = words[:, : nq + self.nv].view(np.float32)
-            fresh.prepare(self.task, self.model, self._layout)
+            inputs[:, num_physics:] = words[:, : model.nu].view(np.float32)
+            words = words[:, model.nu :]
+            stepped.prepare(self.task, model, layout)
+            jobs.append(Job(Worker.step, inputs, stepped, range(len(words)), self._step_work))
+        if resets is not None and np.count_nonzero(resets):
+            fresh = Outputs(numbers[:, -columns:], layout)
+            chosen = np.flatnonzero(resets).tolist()
+            noise = words[:, : self.nq + self.nv].view(np.float32)
+            fresh.prepare(self.task, model, layout)
             jobs.append(Job(Worker.reset, noise, fresh, chosen, self.nv))
         self.threads.run(jobs)
-        if steps:
-            stepped.finish(self.model, state[:, num_physics:])
-        if chosen:
-            fresh.finish(self.model, None)
-        return tuple(
-            values.reshape(*resets.shape, values.shape[-1])
-            for outputs in (stepped, fresh)
-            for values in (outputs.states.view(np.uint32), outputs.rows)
-        )
+        if stepped:
+            stepped.finish(model, state[:, num_physics:])
+        if fresh:
+            fresh.finish(model, None)
+        num_words = 2 * numbers.shape[1]
+        return (numbers.view(np.uint32).reshape(*leading, num_words),)

@@ -41,9 +41,17 @@ _WORTH_SHARING = 400
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where each quantity lies in the packed float32 output row of one environment."""
+    """Where what the host reports of one environment lies.
+
+    First MuJoCo's state and the measured position in float64, then the float32 row of quantities.
+
+    Attributes:
+      shapes: of the quantities, by name.
+      num_physics: numbers in MuJoCo's state.
+    """
 
     shapes: dict[str, tuple[int, ...]]
+    num_physics: int
 
     @classmethod
     def of(cls, model: mujoco.MjModel, task: Task) -> Layout:
@@ -51,10 +59,23 @@ class Layout:
         for name in task.derived:
             columns = _DERIVED_COLUMNS.get(name)
             shapes[name] = (model.nbody, columns) if columns else (model.nv,)
-        return cls({**shapes, "displacement": (2,), "bad": ()})
+        return cls(
+            {**shapes, "displacement": (2,), "bad": ()}, mujoco.mj_stateSize(model, STATE_SPEC)
+        )
+
+    @functools.cached_property
+    def num_state_words(self) -> int:
+        """32-bit words of the state and the measured position."""
+        return 2 * (self.num_physics + 2)
+
+    @functools.cached_property
+    def columns(self) -> int:
+        """Float64 numbers that all of it takes, half a one perhaps unused."""
+        return self.num_physics + 2 + (self.size + 1) // 2
 
     @functools.cached_property
     def size(self) -> int:
+        """Numbers in the row."""
         return sum(int(np.prod(shape)) for shape in self.shapes.values())
 
     @functools.cached_property
@@ -72,7 +93,11 @@ class Layout:
 
 
 class Outputs:
-    """What one host call reports of its environments, ``[num, ...]``; at first zeros.
+    """What one host call reports of its environments after a step, or after a reset.
+
+    Args:
+      numbers: ``[num, layout.columns]`` float64, at first zeros; the rest are views into it.
+      layout: where what lies.
 
     Attributes:
       states: ``[num, num_physics + 2]`` float64, MuJoCo's state and the measured position.
@@ -81,11 +106,11 @@ class Outputs:
       copied: where a worker puts what it reads from ``MjData``, by MuJoCo's name.
     """
 
-    def __init__(self, num: int, num_physics: int, layout: Layout):
-        self.states = np.zeros((num, num_physics + 2))
-        self.rows = np.zeros((num, layout.size), np.float32)
-        self.physics, self.measured = self.states[:, :num_physics], self.states[:, num_physics:]
-        self.bad = self.rows[:, -1]
+    def __init__(self, numbers: np.ndarray, layout: Layout):
+        num_state = layout.num_physics + 2
+        self.states, self.physics = numbers[:, :num_state], numbers[:, : layout.num_physics]
+        self.measured = numbers[:, layout.num_physics : num_state]
+        self.rows = numbers[:, num_state:].view(np.float32)[:, : layout.size]
         self.copied: dict[str, np.ndarray] = {}
 
     def prepare(self, task: Task, model: mujoco.MjModel, layout: Layout) -> None:
@@ -151,7 +176,7 @@ class Worker:
             for to, view in copies:
                 to[i] = view
             if self.warnings.tobytes() != self.no_warning:
-                outputs.bad[i] = (self.warnings[_BAD_WARNINGS] != _WARNED_BEFORE).any()
+                outputs.rows[i, -1] = (self.warnings[_BAD_WARNINGS] != _WARNED_BEFORE).any()
                 self.warnings[:] = _WARNED_BEFORE
 
     def reset(self, noise: np.ndarray, outputs: Outputs, chunk: Sequence[int]) -> None:
@@ -235,6 +260,7 @@ class Threads:
             finally:  # whatever happened here, their MjData are theirs until they are done
                 # One that has not even started is not waited for.
                 started = [helper for helper in helpers if not helper.cancel()]
-                wait(started)
+                if started:
+                    wait(started)
             for helper in started:
                 helper.result()
