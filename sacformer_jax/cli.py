@@ -16,7 +16,7 @@ import tyro
 from sacformer_jax import commands, compilation_cache
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.config import Config, ConfigError
-from sacformer_jax.launch import Launch
+from sacformer_jax.launch import Launch, choose_xla_threads
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.presets import Resolved, resolve
 from sacformer_jax.version import __version__
@@ -131,7 +131,7 @@ def _train(args: list[str]) -> int:
     from sacformer_jax.runner import train
 
     resolved, launch = parse_config(args, "sacformer train")
-    resolved.config.validated()
+    choose_xla_threads(resolved.config.validated())
     launch.join()
     devices = launch.devices(len(resolved.config.all_seeds))
     result = train(resolved.config, resolved.sources, devices=devices)
@@ -142,9 +142,10 @@ def _resume(args: list[str]) -> int:
     from sacformer_jax.runner import resume
 
     parsed = tyro.cli(ResumeArgs, args=args, prog="sacformer resume")
+    known = RunFolder(parsed.run).opened().read_config()
+    choose_xla_threads(known.config)
     parsed.launch.join()
-    members = RunFolder(parsed.run).opened().read_config().members
-    devices = parsed.launch.devices(len(members))
+    devices = parsed.launch.devices(len(known.members))
     result = resume(parsed.run, parsed.total_env_steps, devices=devices)
     return EXIT_INTERRUPTED if result.interrupted else 0
 

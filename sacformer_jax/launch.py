@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import jax
 
-from sacformer_jax.config import ConfigError
+from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.population import Devices
+
+_NARROW = 64
+"""Width of layers up to which a second thread of XLA's did not help PPO, with 1 to 64 environments;
+the updates of the other agents, whose layers are wider, it helps (docs/speed.md).
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,3 +62,15 @@ class Launch:
         if self.seed_devices is not None:
             return Devices(self.seed_devices, self.data_devices)
         return Devices.for_members(num_members, self.data_devices)
+
+
+def choose_xla_threads(config: Config) -> None:
+    """Has XLA use one thread where more make a run slower: PPO with narrow networks on the CPU.
+
+    Its operations are so small that handing them to another thread takes longer than doing them.
+    To be called before JAX is used, later it changes nothing; who sets ``PJRT_NPROC`` or ``NPROC``
+    decides for themselves. MuJoCo's threads are others.
+    """
+    width = max(config.actor.actor_width, config.critic.critic_width)
+    if config.agent == "ppo" and width <= _NARROW and "NPROC" not in os.environ:
+        os.environ.setdefault("PJRT_NPROC", "1")

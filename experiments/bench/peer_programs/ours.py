@@ -9,6 +9,7 @@ import jax
 
 from bench.peer_programs.protocol import Session, Setting
 from sacformer_jax import Config, make_program
+from sacformer_jax.launch import choose_xla_threads
 
 
 def config(setting: Setting) -> Config:
@@ -59,7 +60,9 @@ def _expected(setting: Setting) -> dict[str, Any]:
 def main() -> None:
     """Trains by stretches of one chunk."""
     session = Session()
-    program = make_program(config(session.setting))
+    configured = config(session.setting)
+    choose_xla_threads(configured)  # as the command line does
+    program = make_program(configured)
     state = program.init(jax.random.key(session.setting.seed))
     state, _ = program.prefill(state)
     state, _ = jax.block_until_ready(program.train_chunk(state))
