@@ -180,8 +180,9 @@ def test_members_cost_what_they_cost_alone(hopper: Config, task: str) -> None:
     four = population.train_chunk.lower(population.abstract()).compile()
     assert one > 1e4
     assert four.cost_analysis()["flops"] <= 1.05 * 4 * one
-    # Environments in JAX are reset only when one of them needs it: that is still a condition.
-    assert len(re.findall(r" conditional\(", four.as_text())) == (task == "jax")
+    # Environments in JAX are reset, and random numbers for resets of the others are made, only when
+    # one of them needs it: that is still a condition.
+    assert len(re.findall(r" conditional\(", four.as_text())) == 1
 
 
 def test_any_of_all_is_one_answer_for_all_that_are_batched() -> None:
