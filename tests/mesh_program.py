@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from typing import Any
@@ -73,10 +74,18 @@ def _plain(tree: Any) -> Any:
     )
 
 
+def _with_variances(learner: Any) -> Any:
+    """The statistics' sums of squares, in the thousands, as the variances that are learnt with."""
+    normalizer = learner.normalizer
+    variance = normalizer.m2 / np.maximum(normalizer.count, 1)[:, None]  # [S, O]
+    return dataclasses.replace(learner, normalizer=dataclasses.replace(normalizer, m2=variance))
+
+
 def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    learners = [_with_variances(which["trained"].learner) for which in (one, other)]
     return {
         "prefilled": unequal(one["prefilled"], other["prefilled"]),
-        "learner": largest_difference(one["trained"].learner, other["trained"].learner),
+        "learner": largest_difference(*learners),
         "trained": unequal(one["trained"], other["trained"]),
         "evaluation": largest_difference(one["evaluation"], other["evaluation"]),
         "collectives": other["collectives"],

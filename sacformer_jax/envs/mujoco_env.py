@@ -60,14 +60,12 @@ class MujocoEnv:
         prepared: tuple[Any, jax.Array],
         keys: Callable[[], jax.Array],
     ) -> tuple[tuple[Any, EnvStep], tuple[Any, jax.Array]]:
-        def draw() -> ResetNoise:
-            noise: ResetNoise = jax.vmap(self.reset_noise)(keys())
-            return noise
-
-        def none() -> ResetNoise:
-            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(draw))
-
-        noise = jax.lax.cond(any_of_all(refill), draw, none)
+        num, nq, nv = len(refill), self.engine.nq, self.engine.nv
+        noise = jax.lax.cond(
+            any_of_all(refill),
+            lambda: jax.vmap(self.reset_noise)(keys()),
+            lambda: ResetNoise(qpos=jnp.zeros((num, nq)), qvel=jnp.zeros((num, nv))),
+        )
         stepped, fresh = self.engine.step_and_reset(states, actions, refill, noise)
         fresh_obs = jax.vmap(self.task.observe)(fresh.quantities)
         steps = jax.vmap(self._env_step)(stepped, actions)

@@ -100,15 +100,15 @@ class Outputs:
       layout: where what lies.
 
     Attributes:
-      states: ``[num, num_physics + 2]`` float64, MuJoCo's state and the measured position.
+      physics: ``[num, num_physics]`` float64, MuJoCo's state.
+      measured: ``[num, 2]`` float64, the measured position.
       rows: ``[num, layout.size]`` float32.
-      physics: the part of ``states`` that is MuJoCo's.
       copied: where a worker puts what it reads from ``MjData``, by MuJoCo's name.
     """
 
     def __init__(self, numbers: np.ndarray, layout: Layout):
         num_state = layout.num_physics + 2
-        self.states, self.physics = numbers[:, :num_state], numbers[:, : layout.num_physics]
+        self.physics = numbers[:, : layout.num_physics]
         self.measured = numbers[:, layout.num_physics : num_state]
         self.rows = numbers[:, num_state:].view(np.float32)[:, : layout.size]
         self.copied: dict[str, np.ndarray] = {}
