@@ -1,12 +1,14 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
-:func:`extract`; with :class:`Member` and :class:`Devices` of many members on many devices.
+:func:`extract`; with :class:`Member` and :class:`Devices` of many members on many devices, and
+:class:`Callback` for your own code between chunks.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
 
 from sacformer_jax.api import evaluate
+from sacformer_jax.callbacks import Callback, Event, RunStart, StopAtReturn, StopWithoutProgress
 from sacformer_jax.checkpoint import CheckpointError
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs import VectorEnv, make_env
@@ -16,21 +18,27 @@ from sacformer_jax.loop import DivergedError
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.policy import Policy, load_policy
 from sacformer_jax.population import Devices, Population, make_population
-from sacformer_jax.runner import RunResult, resume, train
+from sacformer_jax.results import RunResult
+from sacformer_jax.runner import resume, train
 from sacformer_jax.train import Program, make_program, policy_of
 from sacformer_jax.version import __version__
 
 __all__ = [
+    "Callback",
     "CheckpointError",
     "Config",
     "ConfigError",
     "Devices",
     "DivergedError",
+    "Event",
     "Member",
     "Policy",
     "Population",
     "Program",
     "RunResult",
+    "RunStart",
+    "StopAtReturn",
+    "StopWithoutProgress",
     "VectorEnv",
     "__version__",
     "evaluate",

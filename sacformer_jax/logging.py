@@ -106,9 +106,11 @@ class TimingLog(_Log):
     def __init__(self, path: Path, tensorboard_dir: Path, purge_after: int | None = None):
         super().__init__(path, _timing_bytes(path, purge_after), tensorboard_dir, purge_after)
 
-    def write(self, env_steps: int, updates: int, values: Record) -> None:
-        """Appends a record of timings."""
-        self._append("timing", {"env_steps": env_steps, "updates": updates, **values})
+    def write(self, env_steps: int, updates: int, values: Record) -> Record:
+        """Appends a record of timings and returns it as written."""
+        record = {"env_steps": env_steps, "updates": updates, **values}
+        self._append("timing", record)
+        return record
 
 
 def _open_cut(path: Path, keep_bytes: int) -> BinaryIO:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 import jax
 import numpy as np
 
+from sacformer_jax.callbacks import Callbacks
 from sacformer_jax.checkpoint import (
     BestSoFar,
     CheckpointError,
@@ -24,11 +23,13 @@ from sacformer_jax.checkpoint import (
 )
 from sacformer_jax.console import Reporter
 from sacformer_jax.evaluate import Evaluation
+from sacformer_jax.fault_report import report_fault
 from sacformer_jax.logging import MetricLog, Record, TimingLog
 from sacformer_jax.population import Population, member_counters, member_metrics
 from sacformer_jax.processes import any_process, gathered, is_first
+from sacformer_jax.signals import stop_on_signal
 from sacformer_jax.train import policy_of
-from sacformer_jax.types import Counters, TrainState
+from sacformer_jax.types import PolicyState, TrainState
 
 
 class DivergedError(Exception):
@@ -48,32 +49,6 @@ def summarize(evaluation: Evaluation) -> Record:
     }
 
 
-@contextmanager
-def stop_on_signal(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """The first SIGINT or SIGTERM asks to stop after the chunk; the second acts at once."""
-    asked: list[int] = []
-    previous: dict[int, Any] = {}
-
-    def restore() -> None:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-    def ask(number: int, frame: Any) -> None:
-        asked.append(number)
-        say("stopping after this chunk, then saving; once more to stop at once")
-        restore()
-
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.signal(number, ask)
-    except ValueError:  # not the main thread: no signals to handle
-        previous.clear()
-    try:
-        yield lambda: bool(asked)
-    finally:
-        restore()
-
-
 class Loop:
     """Runs chunks until the end, with everything that happens between them.
 
@@ -83,6 +58,7 @@ class Loop:
       population: what is trained.
       folder: of the run.
       reporter: what a person sees.
+      callbacks: what users' code sees; it may ask to stop.
       resumed: of the checkpoint gone on from; None at the start.
     """
 
@@ -91,9 +67,11 @@ class Loop:
         population: Population,
         folder: RunFolder,
         reporter: Reporter,
+        callbacks: Callbacks,
         resumed: Progress | None,
     ):
         self.population, self.folder, self.reporter = population, folder, reporter
+        self.callbacks = callbacks
         self.config, self.names = population.config, [m.name for m in population.members]
         self.best: list[BestSoFar | None] = (
             list(resumed.best) if resumed else [None] * len(self.names)
@@ -104,10 +82,11 @@ class Loop:
         self._timings: TimingLog | None = None
         self.started = time.perf_counter()
 
-    def run(self, state: TrainState) -> tuple[int, bool]:
-        """Trains to the end; returns the environment steps done and whether it was interrupted.
+    def run(self, state: TrainState) -> int:
+        """Trains until the end, or until asked to stop; returns the environment steps done.
 
         Raises:
+          Exception: of a callback; the state was saved.
           DivergedError: no member is left that learns; the state was saved.
           CheckpointError: the folder cannot be written (any more); what was saved is intact.
         """
@@ -123,12 +102,14 @@ class Loop:
                         self.population.stored(self.population.block_axes),
                     )
                 )
-                return self._chunks(state, train_chunk, writer)
+                env_steps = self._chunks(state, train_chunk, writer)
             except OSError as error:
                 raise CheckpointError(
                     f"run {str(self.folder.path)!r} cannot be written ({error.strerror}): what "
                     f"was saved is intact; make room, then 'sacformer resume {self.folder.path}'"
                 ) from error
+        self.callbacks.raise_error()
+        return env_steps
 
     def _open_logs(self, stack: ExitStack) -> None:
         if not is_first():
@@ -157,7 +138,7 @@ class Loop:
         state: TrainState,
         train_chunk: Callable[[TrainState], Any],
         writer: CheckpointWriter,
-    ) -> tuple[int, bool]:
+    ) -> int:
         run, reporter = self.config.run, self.reporter
         total, env_steps = run.total_env_steps, int(state.counters.env_steps)
         reporter.start_training(env_steps, total)
@@ -165,7 +146,7 @@ class Loop:
         with stop_on_signal(reporter.say) as stop_asked:
             if self._resumed is None:
                 self._evaluate(state)  # where learning starts from
-            while env_steps < total and not any_process(stop_asked()):
+            while env_steps < total and not any_process(stop_asked() or self.callbacks.stop):
                 before, chunk_start = env_steps, time.perf_counter()
                 state, metrics = jax.block_until_ready(train_chunk(state))
                 env_steps = int(state.counters.env_steps)
@@ -187,22 +168,26 @@ class Loop:
                 f"member more than max_skipped_updates={run.max_skipped_updates} updates were not "
                 "finite; see fault.json there"
             )
-        return env_steps, env_steps < total
+        return env_steps
 
     def _log_chunk(self, state: TrainState, metrics: dict[str, Any], seconds: float) -> None:
         metrics, counters = gathered((metrics, state.counters))
-        env_steps = int(counters.env_steps)
+        env_steps, limit = int(counters.env_steps), self.config.run.max_skipped_updates
+        records: dict[str, Record] = {}
         for index, name in enumerate(self.names):
             own, numbers = member_counters(counters, index), member_metrics(metrics, index)
             if is_first():
-                self._logs[index].write("train", env_steps, int(own.updates), numbers)
-            limit = self.config.run.max_skipped_updates
+                records[name] = self._logs[index].write(
+                    "train", env_steps, int(own.updates), numbers
+                )
             if int(own.skipped_updates) > limit and name not in self.failed:
                 self.failed.add(name)
-                self._report_fault(index, own, state)
+                path = self.folder.member_path(name) / "fault.json"
+                self.reporter.say(report_fault(self.population, index, state, path))
         num_updates = self.config.steps_and_updates[1] * self.config.iterations_per_chunk
+        timings: Record = {}
         if self._timings:
-            self._timings.write(
+            timings = self._timings.write(
                 env_steps,
                 int(np.max(counters.updates)),
                 {
@@ -213,61 +198,31 @@ class Loop:
                 },
             )
         self.reporter.chunk_done(env_steps)
-
-    def _report_fault(self, index: int, counters: Counters, state: TrainState) -> None:
-        """Says and writes down what is known of a member that no longer learns."""
-        name = self.names[index]
-        tensor = self.population.program.agent.checked[int(counters.first_fault)]
-        learner, hyper = gathered((state.learner, state.hyper))
-        bad = {
-            jax.tree_util.keystr(path): int(np.sum(~np.isfinite(leaf[index])))
-            for path, leaf in jax.tree_util.tree_flatten_with_path(learner)[0]
-            if not np.all(np.isfinite(leaf[index]))
-        }
-        largest = {
-            jax.tree_util.keystr(path): float(np.max(np.abs(leaf[index])))
-            for path, leaf in jax.tree_util.tree_flatten_with_path(learner.critic_params)[0]
-        }
-        facts = {
-            "member": name,
-            "env_steps": int(counters.env_steps),
-            "updates": int(counters.updates),
-            "skipped_updates": int(counters.skipped_updates),
-            "bad_physics": int(counters.bad_physics),
-            "first_tensor_not_finite": tensor,
-            "learner_values_not_finite": bad,
-            "largest_critic_parameters": largest,
-            "hyperparameters": {
-                field: float(values[index]) for field, values in vars(hyper).items()
-            },
-        }
-        path = self.folder.member_path(name) / "fault.json"
-        if is_first():
-            path.write_text(json.dumps(facts, indent=2) + "\n")
-        self.reporter.say(
-            f"{name}: {counters.skipped_updates} updates were not finite, {tensor} first; it "
-            f"learns no more. Written to {path}"
-        )
+        self.callbacks.chunk(state, records, timings)
 
     def _evaluate(self, state: TrainState) -> None:
         policies, env_steps = policy_of(state), int(state.counters.env_steps)
         result = self.population.evaluate(policies, np.int32(env_steps))
         result, counters = gathered((result, state.counters))
-        records, improved = [], []
-        for index in range(len(self.names)):
+        records: dict[str, Record] = {}
+        improved = []
+        for index, name in enumerate(self.names):
             record = summarize(jax.tree.map(lambda values, i=index: values[i], result))
             updates = int(member_counters(counters, index).updates)
             if is_first():
                 record = self._logs[index].write("eval", env_steps, updates, record)
-            records.append(record)
+            records[name] = record
             best = self.best[index]
             if best is None or record["return_mean"] > best.return_mean:
                 self.best[index] = BestSoFar(env_steps, record["return_mean"])
                 improved.append(index)
-        self.reporter.evaluated(env_steps, records)
-        if not improved:
-            return
-        policies = gathered(policies)
+        self.reporter.evaluated(env_steps, list(records.values()))
+        if improved:
+            self._save_best(improved, gathered(policies))
+        self.callbacks.evaluation(state, records)
+
+    def _save_best(self, improved: list[int], policies: PolicyState) -> None:
+        """Writes the policies of those members, ``policies`` being everybody's."""
         for index in improved:
             best = self.best[index]
             if is_first() and best is not None:

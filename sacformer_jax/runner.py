@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from sacformer_jax.callbacks import Callback, Callbacks
 from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
@@ -24,25 +24,8 @@ from sacformer_jax.plots import comparison, learning_curve
 from sacformer_jax.population import Devices, Population, make_population
 from sacformer_jax.presets import resolve
 from sacformer_jax.processes import all_here, gathered, is_first
+from sacformer_jax.results import RunResult
 from sacformer_jax.types import TrainState
-
-
-@dataclasses.dataclass(frozen=True)
-class RunResult:
-    """What a run left.
-
-    Attributes:
-      path: the run's folder.
-      env_steps: environment steps done, by each member.
-      evaluations: the ``"eval"`` records of ``metrics.jsonl``; of several members one after the
-        other, with the name as ``"member"``.
-      interrupted: stopped by Ctrl-C (or SIGTERM) before its end.
-    """
-
-    path: Path
-    env_steps: int
-    evaluations: list[Record]
-    interrupted: bool
 
 
 def new_run_path(config: Config) -> Path:
@@ -66,6 +49,7 @@ def train(
     quiet: bool = False,
     members: Sequence[Member] | None = None,
     devices: Devices | None = None,
+    callbacks: Sequence[Callback] = (),
 ) -> RunResult:
     """Trains from the start in a new run folder.
 
@@ -75,12 +59,14 @@ def train(
       quiet: print nothing.
       members: what to train side by side; default: one for each of ``config.all_seeds``.
       devices: how they lie on devices; default: the members over as many as divide them.
+      callbacks: what is called between chunks; see :mod:`sacformer_jax.callbacks`.
 
     Raises:
       ConfigError: a setting cannot work; nothing was written, but for ``config.json`` where prefill
         turns out too short (the folder may be used again).
       CheckpointError: the folder holds a run already or cannot be written.
       DivergedError: too many updates were not finite.
+      Exception: what a callback raised; the run was saved.
     """
     members = seed_members(config.all_seeds) if members is None else members
     population = make_population(config, members, devices or Devices.for_members(len(members)))
@@ -92,7 +78,7 @@ def train(
         if is_first():
             folder.create(config, sources, population.program.env.spec, population.members)
         all_here()
-        return _start(population, folder, quiet)
+        return _start(population, folder, quiet, callbacks)
 
     return _alone_in(folder, begin)
 
@@ -102,6 +88,7 @@ def resume(
     total_env_steps: int | None = None,
     quiet: bool = False,
     devices: Devices | None = None,
+    callbacks: Sequence[Callback] = (),
 ) -> RunResult:
     """Continues a run from its newest good checkpoint, bit for bit as if it had never stopped.
 
@@ -113,11 +100,13 @@ def resume(
       quiet: print nothing.
       devices: how the members lie on devices, as in :func:`train`; it may be another way than that
         of before (with other ``data`` right, but no longer bit for bit the same).
+      callbacks: as in :func:`train`; those of before are not remembered.
 
     Raises:
       CheckpointError: there is nothing to resume, or every checkpoint is damaged.
       ConfigError: ``total_env_steps`` has been reached already.
       DivergedError: too many updates were not finite.
+      Exception: what a callback raised; the run was saved.
     """
     folder = RunFolder(path).opened()
     run = folder.read_config()
@@ -135,7 +124,7 @@ def resume(
 
     def go_on() -> RunResult:
         if folder.latest_step() is None:
-            return _start(population, folder, quiet)
+            return _start(population, folder, quiet, callbacks)
         with Reporter(quiet or not is_first()) as reporter:
             restored = folder.restore(
                 population.stored(population.abstract()),
@@ -155,7 +144,8 @@ def resume(
                     f"note: saved with {restored.host_threads} CPU threads, continued with "
                     f"{usable_cores()}: right, but not bit for bit the same"
                 )
-            return _train_on(population, folder, reporter, state, restored.progress)
+            progress = restored.progress
+            return _train_on(population, folder, reporter, callbacks, state, progress)
 
     return _alone_in(folder, go_on)
 
@@ -192,7 +182,9 @@ def _alone_in(folder: RunFolder, do: Callable[[], RunResult]) -> RunResult:
         return do()
 
 
-def _start(population: Population, folder: RunFolder, quiet: bool) -> RunResult:
+def _start(
+    population: Population, folder: RunFolder, quiet: bool, callbacks: Sequence[Callback]
+) -> RunResult:
     config = population.config
     with Reporter(quiet or not is_first()) as reporter:
         # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
@@ -209,18 +201,33 @@ def _start(population: Population, folder: RunFolder, quiet: bool) -> RunResult:
                     f"context_length={config.context.context_length} steps finished in it; use "
                     "more, or a smaller context_length"
                 )
-        return _train_on(population, folder, reporter, state, None)
+        return _train_on(population, folder, reporter, callbacks, state, None)
 
 
 def _train_on(
     population: Population,
     folder: RunFolder,
     reporter: Reporter,
+    given: Sequence[Callback],
     state: TrainState,
     progress: Progress | None,
 ) -> RunResult:
-    loop = Loop(population, folder, reporter, progress)
-    env_steps, interrupted = loop.run(state)
+    callbacks, result = Callbacks(given, population, folder.path), None
+    callbacks.start(int(state.counters.env_steps), folder.read_config().sources)
+    try:
+        callbacks.raise_error()
+        loop = Loop(population, folder, reporter, callbacks, progress)
+        env_steps = loop.run(state)
+        result = _finished(population, folder, reporter, loop, env_steps)
+    finally:
+        callbacks.end(result)
+    return result
+
+
+def _finished(
+    population: Population, folder: RunFolder, reporter: Reporter, loop: Loop, env_steps: int
+) -> RunResult:
+    """Draws and says what came of it."""
     all_here()
     records = {
         member.name: read_records(folder.metrics_path(member.name)) for member in population.members
@@ -231,14 +238,16 @@ def _train_on(
     }
     if is_first():
         _draw(population, folder, records, evaluations)
-    reporter.closing(loop.started, folder, env_steps, interrupted, evaluations)
+    over = env_steps >= population.config.run.total_env_steps
+    reporter.closing(loop.started, folder, env_steps, not over, evaluations)
     several = len(records) > 1
     rows = [
         {"member": name, **record} if several else record
         for name, own in evaluations.items()
         for record in own
     ]
-    return RunResult(folder.path, env_steps, rows, interrupted)
+    stopped = loop.callbacks.stop and not over
+    return RunResult(folder.path, env_steps, rows, not over and not stopped, stopped)
 
 
 def _draw(
