@@ -35,7 +35,7 @@ from sacformer_jax import (
     train,
 )  # fmt: skip
 from sacformer_jax.checkpoint import RunConfigFile, RunFolder
-from sacformer_jax.cli import EXIT_INTERRUPTED, exit_code, parse_config
+from sacformer_jax.cli import EXIT_INTERRUPTED, Parsed, exit_code, parse_config
 from sacformer_jax.processes import is_first
 from sacformer_jax.types import Hyperparameters
 from sacformer_jax.values import unknown
@@ -210,18 +210,19 @@ def difference(there: RunConfigFile, config: Config, members: Sequence[Member]) 
     return None
 
 
-def train_or_resume(
-    config: Config, sources: dict[str, str], members: Sequence[Member], devices: Devices
-) -> bool:
+def train_or_resume(parsed: Parsed, members: Sequence[Member], devices: Devices) -> bool:
     """Trains what is not trained yet; whether all is.
 
     Raises:
       CheckpointError: the folder holds another run.
     """
+    config, callbacks = parsed.resolved.config, parsed.tracking.callbacks()
     folder, total = RunFolder(config.run.run_dir), config.run.total_env_steps
     latest = folder.latest_step()
     if latest is None:
-        return not train(config, sources, members=members, devices=devices).interrupted
+        sources = parsed.resolved.sources
+        result = train(config, sources, members=members, devices=devices, callbacks=callbacks)
+        return not result.interrupted
     if reason := difference(folder.opened().read_config(), config, members):
         raise CheckpointError(
             f"run_dir={config.run.run_dir!r} holds another run already ({reason}): choose another "
@@ -230,7 +231,7 @@ def train_or_resume(
     if latest >= total:
         print(f"run {folder.path} has done its {total:,} env steps already")
         return True
-    return not resume(folder.path, total, devices=devices).interrupted
+    return not resume(folder.path, total, devices=devices, callbacks=callbacks).interrupted
 
 
 # --- the command -------------------------------------------------------------------------------
@@ -239,15 +240,15 @@ def train_or_resume(
 def sweep(args: argparse.Namespace, flags: list[str]) -> int:
     """Trains, and reports when all is done; the exit code."""
     settings = settings_of(args)
-    resolved, launch = parse_config(flags, "sweep.py")
-    config = resolved.config.validated()
+    parsed = parse_config(flags, "sweep.py")
+    launch, config = parsed.launch, parsed.resolved.config.validated()
     if not config.run.run_dir:
         raise ConfigError("run_dir='': give a folder, so that the same command can go on there")
     members = members_of(settings, config)
     launch.join()
     folder = RunFolder(config.run.run_dir)
     try:
-        done = train_or_resume(config, resolved.sources, members, launch.devices(len(members)))
+        done = train_or_resume(parsed, members, launch.devices(len(members)))
     except DivergedError:
         if is_first():
             report(folder, members)  # tells which settings broke down

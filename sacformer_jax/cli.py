@@ -19,6 +19,7 @@ from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.launch import Launch, choose_xla_threads
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.presets import Resolved, resolve
+from sacformer_jax.tracking import Tracking, resumed_tracking
 from sacformer_jax.version import __version__
 
 EXIT_BAD_INPUT = 2
@@ -59,6 +60,7 @@ class _ConfigArgs:
 
     config: Config
     launch: Launch
+    tracking: Tracking
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,7 +107,16 @@ def _refused(message: str) -> int:
     return EXIT_BAD_INPUT
 
 
-def parse_config(args: list[str], prog: str) -> tuple[Resolved, Launch]:
+@dataclasses.dataclass(frozen=True)
+class Parsed:
+    """What the flags of ``train`` and ``describe`` say."""
+
+    resolved: Resolved
+    launch: Launch
+    tracking: Tracking
+
+
+def parse_config(args: list[str], prog: str) -> Parsed:
     """Reads flags over the preset's values for the agent and environment they name."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     # A flag without its value is left for the real parser to refuse.
@@ -118,23 +129,26 @@ def parse_config(args: list[str], prog: str) -> tuple[Resolved, Launch]:
     parsed = tyro.cli(
         Annotated[_ConfigArgs, tyro.conf.OmitArgPrefixes],
         args=args,
-        default=_ConfigArgs(base.config, Launch()),
+        default=_ConfigArgs(base.config, Launch(), Tracking()),
         prog=prog,
     )
     flags = {arg.split("=")[0].lstrip("-").replace("-", "_") for arg in args if arg[:2] == "--"}
     names = flags | {flag.removeprefix("no_") for flag in flags}
     given = {name: value for name, value in parsed.config.flat().items() if name in names}
-    return resolve(preset, given, "command line"), parsed.launch
+    resolved = resolve(preset, given, "command line")
+    return Parsed(resolved, parsed.launch, parsed.tracking)
 
 
 def _train(args: list[str]) -> int:
     from sacformer_jax.runner import train
 
-    resolved, launch = parse_config(args, "sacformer train")
-    choose_xla_threads(resolved.config.validated())
+    parsed = parse_config(args, "sacformer train")
+    config, launch = parsed.resolved.config.validated(), parsed.launch
+    callbacks = parsed.tracking.callbacks()
+    choose_xla_threads(config)
     launch.join()
-    devices = launch.devices(len(resolved.config.all_seeds))
-    result = train(resolved.config, resolved.sources, devices=devices)
+    devices = launch.devices(len(config.all_seeds))
+    result = train(config, parsed.resolved.sources, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0
 
 
@@ -146,7 +160,8 @@ def _resume(args: list[str]) -> int:
     choose_xla_threads(known.config)
     parsed.launch.join()
     devices = parsed.launch.devices(len(known.members))
-    result = resume(parsed.run, parsed.total_env_steps, devices=devices)
+    callbacks = resumed_tracking(RunFolder(parsed.run).path)
+    result = resume(parsed.run, parsed.total_env_steps, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0
 
 
@@ -154,7 +169,8 @@ def _describe(args: list[str]) -> int:
     if args and not args[0].startswith("-"):
         return commands.describe_run(args)
     as_json = "--json" in args
-    resolved, _ = parse_config([a for a in args if a != "--json"], "sacformer describe")
+    flags = [flag for flag in args if flag != "--json"]
+    resolved = parse_config(flags, "sacformer describe").resolved
     resolved.config.validated()
     if as_json:
         print(json.dumps({"config": resolved.config.to_dict(), "sources": resolved.sources}))

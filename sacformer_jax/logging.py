@@ -1,4 +1,4 @@
-"""Where metrics go: JSONL files and TensorBoard.
+"""Where metrics go: JSONL files, TensorBoard, and at the end of training CSV files.
 
 ``metrics.jsonl`` holds one JSON object a line, without anything that depends on the clock, so that
 two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``updates``.
@@ -19,16 +19,22 @@ Of several members each has such a file of its own; ``timings.jsonl`` is the run
 chunk: ``env_steps``, ``updates``, ``chunk_seconds``, ``steps_per_second``, ``ms_per_update`` (each
 over all members), ``wall_seconds`` (training time since the program started or resumed, evaluations
 included).
+
+When training ends or stops, ``train.csv`` and ``eval.csv`` are written beside ``metrics.jsonl``:
+its lines of that kind, a column for each name, empty for null. TensorBoard has all numbers, as
+``train/critic_loss``, and the settings, for its page of hyperparameters.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from tensorboardX import SummaryWriter
+from tensorboardX.summary import hparams
 
 Record = dict[str, Any]
 
@@ -76,6 +82,7 @@ class MetricLog(_Log):
       keep_bytes: length to cut the file back to, when a run is resumed.
       purge_after: environment steps after which TensorBoard events are dropped, on resume; None
         drops all of them, for a run that starts.
+      settings: of the member, for TensorBoard's page of hyperparameters.
     """
 
     def __init__(
@@ -84,8 +91,21 @@ class MetricLog(_Log):
         tensorboard_dir: Path,
         keep_bytes: int = 0,
         purge_after: int | None = None,
+        settings: dict[str, Any] | None = None,
     ):
         super().__init__(path, keep_bytes, tensorboard_dir, purge_after)
+        if settings:
+            self._add_settings(settings)
+
+    def _add_settings(self, settings: dict[str, Any]) -> None:
+        plain_types = (str, bool, int, float)
+        shown = {
+            name: value if isinstance(value, plain_types) else str(value)
+            for name, value in settings.items()
+        }
+        # Into the same file as the metrics; the writer's own method would begin another run.
+        for summary in hparams(shown, {"eval/return_mean": None}):
+            self._writer.file_writer.add_summary(summary)
 
     @property
     def num_bytes(self) -> int:
@@ -138,3 +158,14 @@ def read_records(path: Path, kind: str | None = None) -> list[Record]:
     with path.open() as lines:
         records = [json.loads(line) for line in lines]
     return [record for record in records if kind in (None, record.get("kind"))]
+
+
+def write_csv(records: list[Record], kind: str, path: Path) -> None:
+    """Writes the records of one kind as CSV, a column for each name in the order they come."""
+    rows = [{k: v for k, v in record.items() if k != "kind"} for record in records]
+    rows = [row for row, record in zip(rows, records, strict=True) if record["kind"] == kind]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

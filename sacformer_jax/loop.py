@@ -123,8 +123,9 @@ class Loop:
             # Later ones belong to what is computed again now.
             prune_best(folder, name, kept[index])
             keep_bytes = resumed.metrics_bytes[index] if resumed else 0
+            settings = self.population.members[index].config(self.config).flat()
             log = MetricLog(
-                folder.metrics_path(name), path / "tensorboard", keep_bytes, purge_after
+                folder.metrics_path(name), path / "tensorboard", keep_bytes, purge_after, settings
             )
             self._logs.append(log)
             stack.callback(log.close)

@@ -16,7 +16,7 @@ from sacformer_jax.console import Reporter
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
-from sacformer_jax.logging import Record, read_records
+from sacformer_jax.logging import Record, read_records, write_csv
 from sacformer_jax.loop import Loop
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.memory import available_bytes, check_fits
@@ -256,13 +256,14 @@ def _draw(
     records: dict[str, list[Record]],
     evaluations: dict[str, list[Record]],
 ) -> None:
-    """A learning curve for each member, and one picture of them all."""
+    """Tables and a learning curve for each member, and one picture of them all."""
     config = population.config
     what = f"{config.agent} on {config.task.env}"
     for member in population.members:
-        picture = folder.member_path(member.name) / "learning_curve.png"
-        title = f"{what}, seed {member.seed}"
-        learning_curve(records[member.name], picture, title)
+        path, own = folder.member_path(member.name), records[member.name]
+        for kind in ("train", "eval"):
+            write_csv(own, kind, path / f"{kind}.csv")
+        learning_curve(own, path / "learning_curve.png", f"{what}, seed {member.seed}")
     if len(records) > 1:
         rows = [
             {"env": config.task.env, "variant": config.agent, "seed": name, **record}

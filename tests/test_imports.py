@@ -43,6 +43,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("plots", "console", "compilation_cache", "launch"),
     ("policy", "results", "signals", "fault_report"),
     ("callbacks",),
+    ("tracking",),
     ("gymnasium_eval", "loop"),
     ("extraction", "runner"),
     ("api",),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sacformer_jax.logging import MetricLog, TimingLog, plain, read_records
+from sacformer_jax.logging import MetricLog, TimingLog, plain, read_records, write_csv
 
 
 def _open(folder: Path, **kwargs: Any) -> MetricLog:
@@ -166,3 +166,30 @@ def test_read_records_by_kind(tmp_path: Path) -> None:
     assert read_records(path, "train") == [train, later]
     assert read_records(path, "eval") == [evaluation]
     assert read_records(path, "other") == []
+
+
+def test_tensorboard_has_the_settings(tmp_path: Path) -> None:
+    settings = {"env": "Hopper", "discount": 0.99, "tune_alpha": True, "target_entropy": None}
+    log = _open(tmp_path, settings=settings)
+    log.write("eval", 100, 0, {"return_mean": 1.0})
+    log.close()
+    (events,) = (tmp_path / "tensorboard").iterdir()
+    content = events.read_bytes()
+    for words in (b"_hparams_/session_start_info", b"tune_alpha", b"Hopper", b"target_entropy"):
+        assert words in content
+    assert np.float64(0.99).tobytes() in content
+    assert content.count(b"eval/return_mean") == 2  # as the metric of the page, and its value
+
+
+def test_csv_has_a_column_for_each_name_and_nothing_for_null(tmp_path: Path) -> None:
+    log = _open(tmp_path)
+    log.write("eval", 0, 0, {"return_mean": -3.25})
+    log.write("train", 100, 50, {"loss": 0.1 + 0.2, "mean": math.nan})
+    log.write("train", 200, 90, {"loss": 2.0, "mean": 1.0, "more": 7})
+    log.close()
+    write_csv(read_records(tmp_path / "metrics.jsonl"), "train", tmp_path / "train.csv")
+    assert (tmp_path / "train.csv").read_text().splitlines() == [
+        "env_steps,updates,loss,mean,more",
+        "100,50,0.30000000000000004,,",
+        "200,90,2.0,1.0,7",
+    ]
