@@ -6,6 +6,7 @@ TensorBoard, JSONL and CSV need nothing of this; see :mod:`sacformer_jax.logging
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import secrets
 import warnings
@@ -67,7 +68,7 @@ class WandbTracker(Callback):
       ConfigError: the package is not installed.
     """
 
-    def __init__(self, project: str, entity: str | None = None, mode: str = "online"):
+    def __init__(self, project: str, entity: str | None = None, mode: WandbMode = "online"):
         try:
             import wandb
         except ModuleNotFoundError as error:
@@ -128,8 +129,7 @@ class WandbTracker(Callback):
     def on_end(self, result: RunResult | None) -> None:
         """Finishes their runs."""
         for started in self._runs.values():
-            code = int(result is None)
-            self._guarded(lambda started=started, code=code: started.finish(exit_code=code))
+            self._guarded(functools.partial(started.finish, exit_code=int(result is None)))
         self._runs = {}
 
     def _send(self, name: str, event: Event, values: Record) -> None:
