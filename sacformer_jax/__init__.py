@@ -1,8 +1,8 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
-:func:`extract`; with :class:`Member` and :class:`Devices` of many members on many devices, and
-:class:`Callback` for your own code between chunks.
+:func:`extract`, :func:`report`; with :class:`Member` and :class:`Devices` of many members on many
+devices, and :class:`Callback` for your own code between chunks.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
@@ -18,6 +18,7 @@ from sacformer_jax.loop import DivergedError
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.policy import Policy, load_policy
 from sacformer_jax.population import Devices, Population, make_population
+from sacformer_jax.report import report
 from sacformer_jax.results import RunResult
 from sacformer_jax.runner import resume, train
 from sacformer_jax.train import Program, make_program, policy_of
@@ -49,6 +50,7 @@ __all__ = [
     "make_population",
     "make_program",
     "policy_of",
+    "report",
     "resume",
     "seed_members",
     "train",

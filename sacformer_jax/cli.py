@@ -1,4 +1,4 @@
-"""The command line: ``sacformer train | resume | evaluate | describe | extract``."""
+"""The command line: ``sacformer train | resume | evaluate | report | describe | extract``."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ commands (each has --help):
   train      train a policy in a new run folder
   resume     continue a run from its newest checkpoint
   evaluate   evaluate a run's policy, here or in Gymnasium
+  report     write an HTML page about one or several runs
   describe   print every setting and where it comes from, or a run's state
   extract    write some seeds of a run as a run of their own
 """
@@ -70,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "train": _train,
         "resume": _resume,
         "evaluate": commands.evaluate,
+        "report": commands.report,
         "describe": _describe,
         "extract": commands.extract,
     }

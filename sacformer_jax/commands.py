@@ -1,4 +1,4 @@
-"""The commands that look at runs: ``sacformer evaluate | describe | extract``."""
+"""The commands that look at runs: ``sacformer evaluate | report | describe | extract``."""
 
 from __future__ import annotations
 
@@ -55,6 +55,16 @@ class ExtractArgs:
     """Their seeds, or names."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ReportArgs:
+    """Write one self-contained HTML page about runs: curves, differences, throughput, faults."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of the runs."""
+    to: Path | None = None
+    """The file; default: report.html in the folder of a single run, or here."""
+
+
 def evaluate(args: list[str]) -> int:
     """``sacformer evaluate``."""
     from sacformer_jax import api
@@ -91,6 +101,15 @@ def evaluate(args: list[str]) -> int:
             f"  {name:<{width}} return {row['return_mean']:9.1f} ± {row['return_std']:.1f}   "
             f"length {row['length_mean']:.0f}"
         )
+    return 0
+
+
+def report(args: list[str]) -> int:
+    """``sacformer report``."""
+    from sacformer_jax.report import report as write_report
+
+    parsed = tyro.cli(ReportArgs, args=args, prog="sacformer report")
+    print(f"written to {write_report(parsed.runs, parsed.to)}")
     return 0
 
 

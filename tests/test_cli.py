@@ -24,6 +24,7 @@ from sacformer_jax.launch import Launch
 from sacformer_jax.members import seed_members
 from sacformer_jax.presets import resolve
 from sacformer_jax.runner import sources_of
+from sacformer_jax.tracking import Tracking
 
 STOP = 400
 HUGE = 1_000_000
@@ -94,8 +95,10 @@ def test_help_of_train_has_every_field(run, monkeypatch: pytest.MonkeyPatch) -> 
     assert said.code == 0
     places = field_places()
     entries = re.findall(r"^[\s│]*(--[a-z][a-z-]*)", said.out, re.MULTILINE)
-    launch = {_flag(field.name) for field in dataclasses.fields(Launch)}
-    assert sorted(entries) == sorted({_flag(name) for name in places} | launch)
+    others = {
+        _flag(field.name) for kind in (Launch, Tracking) for field in dataclasses.fields(kind)
+    }
+    assert sorted(entries) == sorted({_flag(name) for name in places} | others)
     text = _squeezed(said.out)
     flat = Config.from_preset("cpu").flat()
     for name in places:

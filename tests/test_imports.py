@@ -45,13 +45,13 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("callbacks",),
     ("tracking",),
     ("gymnasium_eval", "loop"),
-    ("extraction", "runner"),
+    ("extraction", "runner", "report"),
     ("api",),
     ("commands",),
     ("cli",),
     ("__init__",),
 )
-TOGETHER = ("config", "validation", "presets", "envs", "agents")
+TOGETHER = ("config", "validation", "presets", "envs", "agents", "report")
 NUM_PURE = [line[0] for line in ARROW].index("logging")
 RANK = {name: rank for rank, line in enumerate(ARROW) for name in line}
 PURE = tuple(name for line in ARROW[:NUM_PURE] for name in line)
