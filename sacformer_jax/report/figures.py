@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -142,7 +143,7 @@ def _metric(run: Run, name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array([np.mean(values[step]) for step in steps])
 
 
-def _line(place: int) -> dict[str, str]:
+def _line(place: int) -> dict[str, Any]:
     """Ten colours; dashes tell the lines apart in greyscale, too."""
     return {"color": f"C{place % 10}", "linestyle": _DASHES[place % len(_DASHES)]}
 
