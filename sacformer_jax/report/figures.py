@@ -18,7 +18,7 @@ from sacformer_jax.report.reading import Curve, Run
 _APART = 10
 """Speeds that differ more are drawn on a logarithmic axis."""
 _DASHES = ("-", "--", ":", "-.")
-_STYLE = {
+_STYLE: Any = {
     "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 10, "legend.fontsize": 9,
     "svg.hashsalt": "sacformer-jax",
 }  # fmt: skip
