@@ -1,13 +1,13 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
-:func:`extract`, :func:`report`; with :class:`Member` and :class:`Devices` of many members on many
-devices, and :class:`Callback` for your own code between chunks.
+:func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and :class:`Devices` of many
+members on many devices, and :class:`Callback` for your own code between chunks.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
 
-from sacformer_jax.api import evaluate
+from sacformer_jax.api import collect, evaluate
 from sacformer_jax.callbacks import Callback, Event, RunStart, StopAtReturn, StopWithoutProgress
 from sacformer_jax.checkpoint import CheckpointError
 from sacformer_jax.config import Config, ConfigError
@@ -42,6 +42,7 @@ __all__ = [
     "StopWithoutProgress",
     "VectorEnv",
     "__version__",
+    "collect",
     "evaluate",
     "extract",
     "load_policy",

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 
+from sacformer_jax.collecting import collect_episodes
 from sacformer_jax.config import ConfigError
+from sacformer_jax.datasets import check_dataset_id, write_episodes
 from sacformer_jax.evaluate import make_evaluator
 from sacformer_jax.policy import load_policy
 from sacformer_jax.train import make_training_env
+from sacformer_jax.types import Acted, Context
+
+_SIDE_BY_SIDE = 16
+"""Environments in which episodes are collected."""
 
 
 def evaluate(
@@ -43,10 +49,7 @@ def evaluate(
     from sacformer_jax.gymnasium_eval import evaluate_policy
     from sacformer_jax.loop import summarize
 
-    if episodes < 1:
-        raise ConfigError(f"episodes={episodes}: must be at least 1")
-    if not 0 <= seed < 2**32:
-        raise ConfigError(f"seed={seed}: must be at least 0 and below 2**32")
+    _check(episodes, seed)
     loaded = load_policy(run, policy, member)
     if gymnasium:
         return evaluate_policy(loaded, episodes, seed).record()
@@ -55,3 +58,62 @@ def evaluate(
     record = summarize(evaluator(loaded.state, jax.random.key(seed)))
     names = ("episodes", "return_mean", "return_std", "length_mean")
     return {"env": loaded.config.task.env, **{name: record[name] for name in names}}
+
+
+def collect(
+    run: str | Path,
+    to: str,
+    episodes: int = 100,
+    actions: Literal["mean", "sample", "random"] = "sample",
+    policy: str = "best",
+    seed: int = 0,
+    member: str | int | None = None,
+) -> Path:
+    """Writes episodes of a run's policy as a new local Minari dataset.
+
+    Args:
+      run: the run's folder.
+      to: id of the dataset, ``"namespace/name-v0"``.
+      episodes: number of episodes, at least 1.
+      actions: the policy's mean actions, samples of it, or uniformly random ones.
+      policy: ``"best"`` or ``"latest"``.
+      seed: of resets and samples.
+      member: of a run of several, which: its seed in training, or its name.
+
+    Returns:
+      the dataset's folder.
+
+    Raises:
+      CheckpointError: there is no such run or policy.
+      ConfigError: Minari is not installed, the id is malformed or taken, or another argument
+        cannot work.
+    """
+    _check(episodes, seed)
+    if actions not in ("mean", "sample", "random"):
+        raise ConfigError(f"actions={actions!r}: must be mean, sample or random")
+    check_dataset_id(to)
+    loaded = load_policy(run, policy, member)
+    agent, context_length = loaded.agent, loaded.config.context.context_length
+    env = make_training_env(loaded.config, num_envs=min(episodes, _SIDE_BY_SIDE))
+
+    def choose(context: Context, key: jax.Array) -> Acted:
+        if actions == "random":
+            return Acted(env.random_action(key), context)
+        return agent.act(loaded.state, context, key, explore=actions == "sample")
+
+    key, found = jax.random.key(seed), []
+    cache = agent.init_cache(env.num_envs)
+    for turn in range(-(-episodes // env.num_envs)):
+        turn_key = jax.random.fold_in(key, turn)
+        found += collect_episodes(env, choose, context_length, cache, turn_key)
+    who = "random actions" if actions == "random" else f"{loaded.config.agent}, {actions} actions"
+    return write_episodes(
+        found[:episodes], to, env.spec, who, f"{who} in {env.spec.name}, engine {env.spec.engine}"
+    )
+
+
+def _check(episodes: int, seed: int) -> None:
+    if episodes < 1:
+        raise ConfigError(f"episodes={episodes}: must be at least 1")
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed={seed}: must be at least 0 and below 2**32")

@@ -38,7 +38,8 @@ class RunStart:
       config: the configuration.
       spec: facts of the environment.
       members: what is trained side by side.
-      env_steps: done already; above 0 where a run is resumed.
+      env_steps: done already, prefill included.
+      resumed: whether it goes on from a checkpoint.
       sources: where each value of the configuration comes from.
     """
 
@@ -47,6 +48,7 @@ class RunStart:
     spec: EnvSpec
     members: tuple[Member, ...]
     env_steps: int
+    resumed: bool
     sources: dict[str, str]
 
 
@@ -194,7 +196,7 @@ class Callbacks:
         self.stop = False
         self._made: dict[int, Policy] = {}
 
-    def start(self, env_steps: int, sources: dict[str, str]) -> None:
+    def start(self, env_steps: int, resumed: bool, sources: dict[str, str]) -> None:
         """Calls ``on_start``."""
         population = self._population
         run = RunStart(
@@ -203,6 +205,7 @@ class Callbacks:
             spec=population.program.env.spec,
             members=population.members,
             env_steps=env_steps,
+            resumed=resumed,
             sources=sources,
         )
         self._call(lambda callback: callback.on_start(run))

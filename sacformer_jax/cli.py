@@ -1,4 +1,4 @@
-"""The command line: ``sacformer train | resume | evaluate | report | describe | extract``."""
+"""The command line: ``sacformer train | resume | evaluate | collect | report | …``."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ commands (each has --help):
   train      train a policy in a new run folder
   resume     continue a run from its newest checkpoint
   evaluate   evaluate a run's policy, here or in Gymnasium
+  collect    write a policy's episodes as a Minari dataset
   report     write an HTML page about one or several runs
   describe   print every setting and where it comes from, or a run's state
   extract    write some seeds of a run as a run of their own
@@ -71,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "train": _train,
         "resume": _resume,
         "evaluate": commands.evaluate,
+        "collect": commands.collect,
         "report": commands.report,
         "describe": _describe,
         "extract": commands.extract,

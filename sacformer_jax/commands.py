@@ -65,6 +65,26 @@ class ReportArgs:
     """The file; default: report.html in the folder of a single run, or here."""
 
 
+@dataclasses.dataclass(frozen=True)
+class CollectArgs:
+    """Write a policy's episodes as a new local Minari dataset."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    to: str
+    """Id of the dataset, like hopper/medium-v0; lies under $MINARI_DATASETS_PATH."""
+    episodes: int = 100
+    """Number of episodes."""
+    actions: Literal["mean", "sample", "random"] = "sample"
+    """The policy's mean actions, samples of it, or uniformly random ones."""
+    policy: Literal["best", "latest"] = "best"
+    """Which policy: best or latest."""
+    member: str | None = None
+    """Of a run of several, which: its seed in training, or its name."""
+    seed: int = 0
+    """Seed of resets and samples."""
+
+
 def evaluate(args: list[str]) -> int:
     """``sacformer evaluate``."""
     from sacformer_jax import api
@@ -101,6 +121,24 @@ def evaluate(args: list[str]) -> int:
             f"  {name:<{width}} return {row['return_mean']:9.1f} ± {row['return_std']:.1f}   "
             f"length {row['length_mean']:.0f}"
         )
+    return 0
+
+
+def collect(args: list[str]) -> int:
+    """``sacformer collect``."""
+    from sacformer_jax import api
+
+    parsed = tyro.cli(CollectArgs, args=args, prog="sacformer collect")
+    path = api.collect(
+        parsed.run,
+        to=parsed.to,
+        episodes=parsed.episodes,
+        actions=parsed.actions,
+        policy=parsed.policy,
+        seed=parsed.seed,
+        member=parsed.member,
+    )
+    print(f"written to {path}; start from it with: sacformer train --dataset {parsed.to}")
     return 0
 
 

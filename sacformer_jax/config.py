@@ -32,6 +32,9 @@ CriticName = Literal["mlp", "transformer"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
 
+_PRETRAIN_CHUNK = 250
+
+
 @dataclasses.dataclass(frozen=True)
 class TaskConfig:
     """What is learnt."""
@@ -86,6 +89,16 @@ class ReplayConfig:
     """Windows in a batch; each has up to context_length steps."""
     updates_per_env_step: float = 1.0
     """Gradient updates per environment step (UTD), over all environments."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OfflineConfig:
+    """What is learnt from before going online."""
+
+    dataset: str = ""
+    """Minari dataset, by id, folder or .hdf5 file, that the replay starts with; empty: none."""
+    pretrain_updates: int = 0
+    """Updates on it before the first step, the actor imitating it (sacformer, sac)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,6 +272,7 @@ class Config:
     task: TaskConfig = dataclasses.field(default_factory=TaskConfig)
     run: RunConfig = dataclasses.field(default_factory=RunConfig)
     replay: ReplayConfig = dataclasses.field(default_factory=ReplayConfig)
+    offline: OfflineConfig = dataclasses.field(default_factory=OfflineConfig)
     context: ContextConfig = dataclasses.field(default_factory=ContextConfig)
     actor: ActorConfig = dataclasses.field(default_factory=ActorConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
@@ -352,6 +366,11 @@ class Config:
     def env_steps_per_chunk(self) -> int:
         """Environment steps of one jitted call."""
         return self.iterations_per_chunk * self.steps_and_updates[0] * self.task.num_envs
+
+    @property
+    def updates_per_pretrain_chunk(self) -> int:
+        """Updates of one jitted call of pretraining; their number is rounded up to whole calls."""
+        return min(self.offline.pretrain_updates, _PRETRAIN_CHUNK)
 
     @property
     def prefill_vector_steps(self) -> int:

@@ -27,6 +27,14 @@ class ActionDistribution(Protocol):
         """
         ...
 
+    def imitation_loss(self, action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+        """What is minimal where the actor does as it was shown, ``[...]``."""
+        ...
+
+
+_ON_THE_BOUND = 1.0 - 1e-3
+"""Squashed actions beyond count as this: the inverse of tanh at the bounds is infinite."""
+
 
 @dataclasses.dataclass(frozen=True)
 class _Box:
@@ -52,6 +60,9 @@ class _Box:
         """The action at the mean, ``[..., A]``: ``center + half_range * tanh(mean)``."""
         return self._center + self._half_range * jnp.tanh(mean)
 
+    def _in_unit_box(self, action: jax.Array) -> jax.Array:
+        return (action - self._center) / self._half_range
+
 
 @dataclasses.dataclass(frozen=True)
 class TanhGaussian(_Box):
@@ -74,10 +85,19 @@ class TanhGaussian(_Box):
           ``(action [..., A], log_prob [...])``.
         """
         u = mean + jnp.exp(log_std) * noise
+        log_prob = self._log_density(u, noise, log_std)
+        return self._center + self._half_range * jnp.tanh(u), log_prob
+
+    def imitation_loss(self, action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+        """Minus the log density of an action, ``[...]``; one on the bounds is drawn in a little."""
+        u = jnp.arctanh(jnp.clip(self._in_unit_box(action), -_ON_THE_BOUND, _ON_THE_BOUND))
+        return -self._log_density(u, (u - mean) * jnp.exp(-log_std), log_std)
+
+    def _log_density(self, u: jax.Array, noise: jax.Array, log_std: jax.Array) -> jax.Array:
+        """Of the action that ``u = mean + exp(log_std) noise`` is squashed to."""
         gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
         squash = 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u)) + np.log(self._half_range)
-        log_prob = jnp.sum(gaussian - squash, axis=-1)
-        return self._center + self._half_range * jnp.tanh(u), log_prob
+        return jnp.sum(gaussian - squash, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,3 +126,8 @@ class NoisyPoint(_Box):
         action = self.mode(mean) + self._half_range * noise
         bounded = jnp.clip(action, jnp.asarray(self.low), jnp.asarray(self.high))
         return bounded, jnp.zeros(mean.shape[:-1])
+
+    def imitation_loss(self, action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+        """The squared distance to an action, in half ranges, ``[...]``."""
+        del log_std
+        return jnp.sum((self._in_unit_box(action) - jnp.tanh(mean)) ** 2, axis=-1)

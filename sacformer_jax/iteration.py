@@ -122,6 +122,14 @@ class TrainingFunctions:
         state, stats, _ = self._collect(state, random_action, self.config.prefill_vector_steps)
         return state, stats.metrics()
 
+    def pretrain_chunk(self, state: TrainState) -> tuple[TrainState, Metrics]:
+        learning, num_updates = self.learning, self.config.updates_per_pretrain_chunk
+        assert isinstance(learning, ReplayLearning)
+        key, updates_key = jax.random.split(state.key)
+        state, metrics, done = learning.pretrain(state, updates_key, num_updates)
+        counters = _counted(state.counters, metrics["fault"], done)
+        return dataclasses.replace(state, counters=counters, key=key), _update_means(metrics)
+
     def train_chunk(self, state: TrainState) -> tuple[TrainState, Metrics]:
         def scanned(state: TrainState, _: None) -> tuple[TrainState, Any]:
             return self._iteration(state)

@@ -12,6 +12,11 @@ two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``u
   ``approx_kl`` (nats), ``clip_fraction``, ``explained_variance`` (of the value targets, before the
   round's updates), ``learning_rate`` (the actor's); its losses are the clipped ones, without
   coefficients, and its gradient norms those before scaling down.
+``kind = "pretrain"``, where there is a dataset: one line for each 250 updates on it, with
+  ``critic_loss``, ``q_mean``, ``critic_grad_norm``, ``actor_loss`` (minus the log density of the
+  actions shown, in nats; of a deterministic policy the squared distance), ``actor_grad_norm``,
+  ``action_error`` (mean distance of the mean action to that shown, in units of the action),
+  ``skipped_updates``.
 ``kind = "eval"``, one line an evaluation:
   ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``.
 

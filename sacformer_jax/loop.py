@@ -144,9 +144,12 @@ class Loop:
         total, env_steps = run.total_env_steps, int(state.counters.env_steps)
         reporter.start_training(env_steps, total)
         self.started = time.perf_counter()
+        state = self._pretrained(state)
         with stop_on_signal(reporter.say) as stop_asked:
             if self._resumed is None:
                 self._evaluate(state)  # where learning starts from
+                if self.population.pretrain_chunk is not None:
+                    self._save(writer, state)  # what took long is not to be done again
             while env_steps < total and not any_process(stop_asked() or self.callbacks.stop):
                 before, chunk_start = env_steps, time.perf_counter()
                 state, metrics = jax.block_until_ready(train_chunk(state))
@@ -170,6 +173,27 @@ class Loop:
                 "finite; see fault.json there"
             )
         return env_steps
+
+    def _pretrained(self, state: TrainState) -> TrainState:
+        """After the updates on the dataset, where there are any to make; unsaved until its end."""
+        pretrain_chunk, config = self.population.pretrain_chunk, self.config
+        if pretrain_chunk is None or self._resumed is not None:
+            return state
+        wanted = config.offline.pretrain_updates
+        with self.reporter.timed(f"pretraining: {wanted:,} updates on the dataset"):
+            for _ in range(-(-wanted // config.updates_per_pretrain_chunk)):
+                state, metrics = jax.block_until_ready(pretrain_chunk(state))
+                gathered_metrics, counters = gathered((metrics, state.counters))
+                env_steps, numbers = int(counters.env_steps), []
+                for index in range(len(self.names)):
+                    own = member_metrics(gathered_metrics, index)
+                    updates = int(member_counters(counters, index).updates)
+                    numbers.append(own)
+                    if is_first():
+                        self._logs[index].write("pretrain", env_steps, updates, own)
+        losses = [float(own["actor_loss"]) for own in numbers]
+        self.reporter.say(f"pretraining: actor loss {np.mean(losses):.2f} at its end")
+        return state
 
     def _log_chunk(self, state: TrainState, metrics: dict[str, Any], seconds: float) -> None:
         metrics, counters = gathered((metrics, state.counters))

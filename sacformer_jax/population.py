@@ -113,6 +113,8 @@ class Population:
       prefill: ``TrainState -> (TrainState, metrics [S])``; the argument is donated.
       refill: what checkpoints hold (:meth:`stored`) -> ``(TrainState, metrics [S])``.
       train_chunk: ``TrainState -> (TrainState, metrics [S])``; the argument is donated.
+      pretrain_chunk: ``TrainState -> (TrainState, metrics [S])``; the argument is donated. None
+        where the configuration asks for none.
       evaluate: ``(policies [S, ...], env_steps) -> Evaluation [S, E]``, by the members' seeds.
       num_drawable: ``BufferState -> [S]``, see
         :meth:`~sacformer_jax.buffer.TrajectoryBuffer.num_drawable`; None without a replay.
@@ -127,6 +129,7 @@ class Population:
     prefill: jax.stages.Wrapped
     refill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
+    pretrain_chunk: jax.stages.Wrapped | None
     evaluate: Callable[[PolicyState, Any], Evaluation]
     num_drawable: jax.stages.Wrapped | None
 
@@ -220,6 +223,9 @@ def make_population(
         prefill=split(program.prefill, (specs,), chunk_specs, donate=True),
         refill=split(program.refill, (without_replay(specs),), chunk_specs),
         train_chunk=split(program.train_chunk, (specs,), chunk_specs, donate=True),
+        pretrain_chunk=None
+        if program.pretrain_chunk is None
+        else split(program.pretrain_chunk, (specs,), chunk_specs, donate=True),
         evaluate=lambda policy, env_steps: evaluate_all(policy, seeds, env_steps),
         num_drawable=None
         if program.replay is None

@@ -207,6 +207,8 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
         for layer in PRESETS[preset]
         if layer.agent in (None, chosen.agent) and layer.env in (None, chosen.task.env)
     ]
+    if fields.get("dataset"):
+        layers.append(Layer("the dataset is there instead", {"prefill_env_steps": 0}))
     for layer in [*layers, Layer(given, fields)]:
         config = config.replace(**layer.values)
         sources.update(dict.fromkeys(layer.values, layer.source))

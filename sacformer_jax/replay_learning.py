@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax.agents.core import Agent, Metrics
+from sacformer_jax.agents.core import Agent, Metrics, Update
 from sacformer_jax.buffer import TrajectoryBuffer, weighted_by_share
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.types import BufferState, Hyperparameters, LearnerState, TrainState
@@ -34,9 +34,21 @@ class ReplayLearning:
         self, state: TrainState, key: jax.Array, num_updates: int
     ) -> tuple[TrainState, Metrics, jax.Array]:
         """The state after ``num_updates`` updates, their metrics, and how many count (int32)."""
+        return self._many(self.agent.update, state, key, num_updates)
+
+    def pretrain(
+        self, state: TrainState, key: jax.Array, num_updates: int
+    ) -> tuple[TrainState, Metrics, jax.Array]:
+        """The same with updates of pretraining."""
+        assert self.agent.pretrain is not None
+        return self._many(self.agent.pretrain, state, key, num_updates)
+
+    def _many(
+        self, update: Update, state: TrainState, key: jax.Array, num_updates: int
+    ) -> tuple[TrainState, Metrics, jax.Array]:
         assert state.buffer is not None
         learner, metrics = jax.lax.scan(
-            partial(self.update, state.buffer, state.hyper),
+            partial(self._one, update, state.buffer, state.hyper),
             state.learner,
             jax.random.split(key, num_updates),
         )
@@ -52,6 +64,16 @@ class ReplayLearning:
         self, buffer: BufferState, hyper: Hyperparameters, learner: LearnerState, key: jax.Array
     ) -> tuple[LearnerState, Metrics]:
         """One update, on a batch drawn for it."""
+        return self._one(self.agent.update, buffer, hyper, learner, key)
+
+    def _one(
+        self,
+        update: Update,
+        buffer: BufferState,
+        hyper: Hyperparameters,
+        learner: LearnerState,
+        key: jax.Array,
+    ) -> tuple[LearnerState, Metrics]:
         sample_key, update_key = jax.random.split(key)
         batch_size = self.batch_size // self.data.size
         window = self.buffer.sample(
@@ -59,4 +81,4 @@ class ReplayLearning:
         )
         if self.data.size > 1:
             window = weighted_by_share(window, self.buffer.num_drawable(buffer))
-        return self.agent.update(learner, hyper, window, update_key)
+        return update(learner, hyper, window, update_key)

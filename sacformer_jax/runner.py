@@ -14,12 +14,14 @@ from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
 from sacformer_jax.cores import usable_cores
+from sacformer_jax.datasets import described, read_episodes
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
 from sacformer_jax.logging import Record, read_records, write_csv
 from sacformer_jax.loop import Loop
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.memory import available_bytes, check_fits
+from sacformer_jax.offline import Episode, check_episodes, with_dataset
 from sacformer_jax.plots import comparison, learning_curve
 from sacformer_jax.population import Devices, Population, make_population
 from sacformer_jax.presets import resolve
@@ -71,6 +73,7 @@ def train(
     members = seed_members(config.all_seeds) if members is None else members
     population = make_population(config, members, devices or Devices.for_members(len(members)))
     check_memory(population)
+    dataset_of(population)  # what is wrong with it is said before anything is written
     folder = RunFolder(new_run_path(config))
     sources = sources or sources_of(config)
 
@@ -150,6 +153,25 @@ def resume(
     return _alone_in(folder, go_on)
 
 
+def dataset_of(population: Population) -> list[Episode]:
+    """The episodes that the replay is to start with; empty where there is no dataset.
+
+    Raises:
+      ConfigError: it cannot be read, or does not fit the task; or there are several processes.
+    """
+    config = population.config
+    if not config.offline.dataset:
+        return []
+    if jax.process_count() > 1:
+        raise ConfigError(
+            f"dataset={config.offline.dataset!r}: can be read by one process only; start it in "
+            "one, and resume in several"
+        )
+    episodes = read_episodes(config.offline.dataset)
+    check_episodes(episodes, population.program.env.spec, config)
+    return episodes
+
+
 def check_memory(population: Population) -> None:
     """Refuses a replay, if there is one, that does not fit in a device.
 
@@ -185,15 +207,19 @@ def _alone_in(folder: RunFolder, do: Callable[[], RunResult]) -> RunResult:
 def _start(
     population: Population, folder: RunFolder, quiet: bool, callbacks: Sequence[Callback]
 ) -> RunResult:
-    config = population.config
+    config, episodes = population.config, dataset_of(population)
     with Reporter(quiet or not is_first()) as reporter:
         # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
         # then compile to the same programs, and resuming finds them in the compilation cache.
         state = jax.device_put(population.init(), population.shardings)
         reporter.facts(population, state, folder.path)
+        if episodes:
+            state, dropped = with_dataset(population, state, episodes)
+            reporter.say(described(config.offline.dataset, episodes, dropped))
         if population.num_drawable is not None:
-            with reporter.timed("compiling and running prefill"):
-                state, _ = jax.block_until_ready(population.prefill(state))
+            if config.prefill_vector_steps:
+                with reporter.timed("compiling and running prefill"):
+                    state, _ = jax.block_until_ready(population.prefill(state))
             drawable = gathered(population.num_drawable(state.buffer))
             if not np.all(drawable > 0):
                 raise ConfigError(
@@ -213,7 +239,8 @@ def _train_on(
     progress: Progress | None,
 ) -> RunResult:
     callbacks, result = Callbacks(given, population, folder.path), None
-    callbacks.start(int(state.counters.env_steps), folder.read_config().sources)
+    sources = folder.read_config().sources
+    callbacks.start(int(state.counters.env_steps), progress is not None, sources)
     try:
         callbacks.raise_error()
         loop = Loop(population, folder, reporter, callbacks, progress)

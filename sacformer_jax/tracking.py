@@ -151,7 +151,7 @@ class WandbTracker(Callback):
     def _ids(self, run: RunStart) -> dict[str, str]:
         """An id of theirs for each member, kept in the run's folder."""
         path = run.path / "wandb.json"
-        known = json.loads(path.read_text()) if path.exists() and run.env_steps else {}
+        known = json.loads(path.read_text()) if path.exists() and run.resumed else {}
         ids = known.get("ids", {})
         for member in run.members:
             ids.setdefault(member.name, secrets.token_hex(4))

@@ -52,6 +52,9 @@ class Program:
       refill: the same as ``prefill`` from fresh episodes, under the policy, whatever the state's
         environments and replay were (None perhaps); the argument is not donated.
       train_chunk: ``TrainState -> (TrainState, metrics)``, one chunk; the argument is donated.
+      pretrain_chunk: ``TrainState -> (TrainState, metrics)``, imitation of what the replay holds,
+        without a step of the environments; the argument is donated. None where the configuration
+        asks for none.
     """
 
     config: Config
@@ -62,6 +65,7 @@ class Program:
     prefill: jax.stages.Wrapped
     refill: jax.stages.Wrapped
     train_chunk: jax.stages.Wrapped
+    pretrain_chunk: jax.stages.Wrapped | None
 
     @property
     def buffer(self) -> TrajectoryBuffer:
@@ -134,6 +138,9 @@ def make_program(
         prefill=jax.jit(functions.prefill, donate_argnums=0),
         refill=jax.jit(functions.refill),
         train_chunk=jax.jit(functions.train_chunk, donate_argnums=0),
+        pretrain_chunk=jax.jit(functions.pretrain_chunk, donate_argnums=0)
+        if config.offline.pretrain_updates
+        else None,
     )
 
 

@@ -45,7 +45,7 @@ def check(config: Config) -> None:
     for name in (
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
         "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
-        "value_coefficient",
+        "value_coefficient", "pretrain_updates",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _check_seeds(config)
@@ -55,6 +55,7 @@ def check(config: Config) -> None:
     _check_target_return(config)
     _check_acting(config)
     _check_critic(config)
+    _check_offline(config)
     if config.agent == "ppo":
         _check_ppo(config)
     else:
@@ -255,6 +256,32 @@ def _check_critic(config: Config) -> None:
     )
 
 
+def _check_offline(config: Config) -> None:
+    offline = config.offline
+    if not offline.dataset:
+        _require(
+            offline.pretrain_updates == 0,
+            f"pretrain_updates={offline.pretrain_updates}: there is nothing to learn from; give a "
+            "dataset, or use pretrain_updates=0",
+        )
+        return
+    _require(
+        config.agent != "ppo",
+        f"dataset={offline.dataset!r}: agent=ppo learns from its own steps alone; use another "
+        "agent, or dataset=''",
+    )
+    _require(
+        offline.pretrain_updates == 0 or config.agent in ("sacformer", "sac"),
+        f"pretrain_updates={offline.pretrain_updates}: agent={config.agent} can only begin with "
+        "the dataset in its replay; use pretrain_updates=0, or agent=sacformer or sac",
+    )
+    _require(
+        config.run.checkpoint_replay,
+        f"dataset={offline.dataset!r}: is in the replay, which checkpoint_replay=False does not "
+        "save; use checkpoint_replay=True",
+    )
+
+
 def _check_steps(config: Config) -> None:
     task, run, replay = config.task, config.run, config.replay
     _require(
@@ -283,8 +310,11 @@ def _check_steps(config: Config) -> None:
         f"updates_per_env_step={replay.updates_per_env_step}: makes over 2**31 updates in "
         f"total_env_steps={run.total_env_steps}, beyond the counters' range",
     )
-    needed = 1
-    if config.context.return_conditioning == "hindsight" or config.context.window == "scattered":
+    needed = 0 if config.offline.dataset else 1
+    whole_episodes = (
+        config.context.return_conditioning == "hindsight" or config.context.window == "scattered"
+    )
+    if needed and whole_episodes:
         # Only finished episodes are replayed.
         needed = task.max_episode_steps
     _require(

@@ -115,7 +115,8 @@ def test_they_are_called_in_order(watched: Watched) -> None:
     ]
     (start,) = seen.starts
     assert start.path == watched.result.path
-    assert (start.env_steps, start.spec.name, start.config.agent) == (200, "Hopper", "sac")
+    assert (start.env_steps, start.resumed) == (200, False)
+    assert (start.spec.name, start.config.agent) == ("Hopper", "sac")
     assert [member.name for member in start.members] == ["seed-0", "seed-1"]
     assert start.sources["total_env_steps"] == "given"
     assert seen.results == [watched.result]
@@ -174,7 +175,7 @@ def test_false_stops_the_run_and_it_goes_on_as_if_nothing_had_been(
     result = resume(path, quiet=True, callbacks=[seen])
     assert (result.env_steps, result.stopped, result.interrupted) == (TOTAL, False, False)
     assert seen.calls == ["start", "chunk", "chunk", "eval", "end"]
-    assert seen.starts[0].env_steps == 400
+    assert (seen.starts[0].env_steps, seen.starts[0].resumed) == (400, True)
     for name in ("seed-0", "seed-1"):
         ends = [load_policy(run, "latest", name).state for run in (path, watched.result.path)]
         assert digest(ends[0]) == digest(ends[1])

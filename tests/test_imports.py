@@ -33,6 +33,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("train",),
     ("evaluate",),
     ("population",),
+    ("offline",),
     # Here the outside world begins.
     ("logging", "processes", "digests", "memory"),
     ("stored",),
@@ -40,8 +41,8 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("run_folder",),
     ("saved_policies",),
     ("checkpoint",),
-    ("plots", "console", "compilation_cache", "launch"),
-    ("policy", "results", "signals", "fault_report"),
+    ("plots", "datasets", "console", "compilation_cache", "launch"),
+    ("policy", "collecting", "results", "signals", "fault_report"),
     ("callbacks",),
     ("tracking",),
     ("gymnasium_eval", "loop"),

@@ -12,8 +12,8 @@ from sacformer_jax.run_folder import RunFolder
 optuna = pytest.importorskip("optuna")
 TINY = {
     "agent": "sac", "env": "Hopper", "max_episode_steps": 50, "num_envs": 2,
-    "prefill_env_steps": 200, "chunk_env_steps": 100, "eval_every": 100, "eval_episodes": 1,
-    "total_env_steps": 500, "batch_size": 4, "actor_width": 8, "critic_width": 8,
+    "prefill_env_steps": 200, "chunk_env_steps": 100, "eval_every": 100, "eval_episodes": 2,
+    "total_env_steps": 500, "batch_size": 4, "actor_width": 8, "actor_layers": 1, "critic_width": 8,
     "buffer_capacity": 2_000,
 }  # fmt: skip
 

@@ -121,6 +121,8 @@ class Agent:
       checked: names of the tensors that are looked at, in the order in which they come about.
       prepare: makes a rollout ready to learn from, of an agent that keeps no replay; None for those
         that do.
+      pretrain: like ``update``, but the actor does as the steps of the batch show; None for agents
+        that cannot.
     """
 
     init: Init
@@ -129,3 +131,4 @@ class Agent:
     update: Update
     checked: tuple[str, ...]
     prepare: Prepare | None = None
+    pretrain: Update | None = None

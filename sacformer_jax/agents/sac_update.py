@@ -60,6 +60,7 @@ def make_sac_agent(parts: SACParts) -> Agent:
         act=partial(sac_policy.act, parts),
         update=partial(_update, parts),
         checked=CHECKED,
+        pretrain=partial(_pretrain, parts),
     )
 
 
@@ -89,9 +90,35 @@ def _init(parts: SACParts, key: jax.Array) -> LearnerState:
     )
 
 
-def _update(
+@dataclasses.dataclass(frozen=True)
+class _Half:
+    """An update after the critics' step, before the actor's.
+
+    Attributes:
+      learner: with the critics stepped.
+      metrics: of the critics.
+      non_finite: how many numbers were not finite in each tensor of ``CHECKED`` so far.
+      inputs: of the critics.
+      weights: of the steps.
+      gaussian: π at the steps.
+      pull_back: takes a gradient of ``gaussian`` to the actor's parameters.
+      noise: standard normal ``[B, K, A]``, for the actor's loss.
+    """
+
+    learner: LearnerState
+    metrics: Metrics
+    non_finite: list[jax.Array]
+    inputs: CriticInputs
+    weights: StepWeights
+    gaussian: GaussianParams
+    pull_back: Callable[[GaussianParams], tuple[Params]]
+    noise: jax.Array
+
+
+def _after_critics(
     parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
-) -> tuple[LearnerState, Metrics]:
+) -> _Half:
+    """π over the window, and the critics' step."""
     keys = jax.random.split(key, 3)
     # Both in one draw: a draw costs time however small it is.
     next_noise, noise = jax.vmap(lambda key: parts.data.normal(key, window.action.shape))(keys[1:])
@@ -103,12 +130,40 @@ def _update(
 
     gaussian, pull_back, next_gaussian = jax.vjp(policies, learner.actor_params, has_aux=True)
     inputs, weights = _critic_inputs(parts, learner, window), step_weights(parts, window)
-    learner, critic_metrics, non_finite = _update_critics(
+    learner, metrics, non_finite = _update_critics(
         parts, learner, hyper, window, inputs, weights, gaussian, next_gaussian, next_noise
     )
-    learner, actor_metrics, fault = _update_actor(
-        parts, learner, hyper, inputs, weights, non_finite, gaussian, pull_back, noise
-    )
+    return _Half(learner, metrics, non_finite, inputs, weights, gaussian, pull_back, noise)
+
+
+def _pretrain(
+    parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
+) -> tuple[LearnerState, Metrics]:
+    """The actor imitates the steps, by maximum likelihood as a Decision Transformer does (of a
+    deterministic policy by least squares); the critics learn what it is worth, by SAC's own step.
+    The temperature stays.
+    """
+    half = _after_critics(parts, learner, hyper, window, key)
+    learner, weights = half.learner, half.weights
+
+    def loss(gaussian: GaussianParams) -> jax.Array:
+        each = parts.distribution.imitation_loss(window.action, gaussian.mean, gaussian.log_std)
+        return jnp.sum(weights.actor * each)
+
+    value, gaussian_grads = jax.value_and_grad(loss)(half.gaussian)
+    (grads,) = half.pull_back(gaussian_grads)
+    shown = parts.distribution.mode(half.gaussian.mean)
+    error = jnp.sum(weights.actor * jnp.mean(jnp.abs(shown - window.action), axis=-1))
+    value, error, grads = parts.data.sum((value, error, grads))
+    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
+    return learner, {**half.metrics, **metrics, "action_error": error, "fault": fault}
+
+
+def _update(
+    parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
+) -> tuple[LearnerState, Metrics]:
+    half = _after_critics(parts, learner, hyper, window, key)
+    learner, actor_metrics, fault = _update_actor(parts, hyper, half)
     # Temperature: J(α) = E[-α (log π + target entropy)].
     alpha = _alpha(learner)
     if parts.tune_alpha:
@@ -118,7 +173,7 @@ def _update(
             hyper.alpha_learning_rate,
         )  # fmt: skip
         learner = dataclasses.replace(learner, log_alpha=log_alpha, alpha_opt=alpha_opt)
-    return learner, {**critic_metrics, **actor_metrics, "alpha": alpha, "fault": fault}
+    return learner, {**half.metrics, **actor_metrics, "alpha": alpha, "fault": fault}
 
 
 def _alpha(learner: LearnerState) -> jax.Array:
@@ -173,29 +228,22 @@ def _update_critics(
 
 
 def _update_actor(
-    parts: SACParts,
-    learner: LearnerState,
-    hyper: Hyperparameters,
-    inputs: CriticInputs,
-    weights: StepWeights,
-    non_finite: list[jax.Array],
-    gaussian: GaussianParams,
-    pull_back: Callable[[GaussianParams], tuple[Params]],
-    noise: jax.Array,
+    parts: SACParts, hyper: Hyperparameters, half: _Half
 ) -> tuple[LearnerState, Metrics, jax.Array]:
-    """Eq. 10-13, through the distributions whose gradient ``pull_back`` takes to the parameters."""
+    """Eq. 10-13, through the distributions whose gradient is pulled back to the parameters."""
+    learner, weights, inputs = half.learner, half.weights, half.inputs
     alpha = _alpha(learner)
 
     def loss(gaussian: GaussianParams) -> tuple[jax.Array, jax.Array]:
         action, log_prob = parts.distribution.sample_and_log_prob(
-            noise, gaussian.mean, gaussian.log_std
+            half.noise, gaussian.mean, gaussian.log_std
         )
         min_q = jnp.min(parts.critics.now(learner.critic_params, inputs, action), axis=0)
         return jnp.sum(weights.actor * (alpha * log_prob - min_q)), log_prob
 
-    (value, log_prob), gaussian_grads = jax.value_and_grad(loss, has_aux=True)(gaussian)
-    (grads,) = pull_back(gaussian_grads)
+    (value, log_prob), gaussian_grads = jax.value_and_grad(loss, has_aux=True)(half.gaussian)
+    (grads,) = half.pull_back(gaussian_grads)
     entropy = -jnp.sum(weights.actor * log_prob)
     value, entropy, grads = parts.data.sum((value, entropy, grads))
-    learner, metrics, fault = step_actor(learner, hyper, value, grads, non_finite)
+    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
     return learner, {**metrics, "entropy": entropy}, fault

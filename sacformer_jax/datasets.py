@@ -1,0 +1,161 @@
+"""Minari datasets: episodes read from them, and a policy's episodes written as one."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.offline import Episode
+
+
+def minari_or_refuse(what: str) -> Any:
+    """The package ``minari``.
+
+    Raises:
+      ConfigError: it is not installed; the message starts with ``what``.
+    """
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"{what}: Minari is not installed; pip install 'sacformer-jax[minari]'"
+        ) from error
+    return minari
+
+
+def read_episodes(dataset: str) -> list[Episode]:
+    """The episodes of a Minari dataset, in their order.
+
+    Args:
+      dataset: an id among the local datasets (``"mujoco/hopper/expert-v0"``; nothing is
+        downloaded), a dataset's folder, its ``data`` folder, or the HDF5 file in that.
+
+    Raises:
+      ConfigError: Minari is not installed, there is no such dataset, or its observations or
+        actions are not plain vectors.
+    """
+    what = f"dataset={dataset!r}"
+    minari = minari_or_refuse(what)
+    try:
+        found = _opened(minari, dataset)
+    except (FileNotFoundError, ValueError, OSError, KeyError) as error:
+        raise ConfigError(
+            f"{what}: is no local Minari dataset ({str(error).splitlines()[0]}); give an id that "
+            "'minari list local' shows (get one by 'minari download'), or its folder"
+        ) from error
+    for name in ("observation", "action"):
+        space = getattr(found.spec, f"{name}_space")
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise ConfigError(f"{what}: its {name}s are {space}; they must be vectors (a 1-D Box)")
+    return [_episode(episode) for episode in found.iterate_episodes()]
+
+
+def _opened(minari: Any, dataset: str) -> Any:
+    path = Path(dataset).expanduser()
+    if path.is_file():
+        path = path.parent
+    if not path.is_dir():
+        return minari.load_dataset(dataset)
+    return minari.MinariDataset(path / "data" if (path / "data").is_dir() else path)
+
+
+def _episode(episode: Any) -> Episode:
+    return Episode(
+        obs=np.asarray(episode.observations, np.float32),
+        action=np.asarray(episode.actions, np.float32),
+        reward=np.asarray(episode.rewards, np.float32),
+        terminated=bool(np.any(episode.terminations)),
+    )
+
+
+def described(dataset: str, episodes: Sequence[Episode], dropped: int) -> str:
+    """A line about a dataset that was read."""
+    returns = [episode.episode_return for episode in episodes]
+    steps = sum(map(len, episodes))
+    text = (
+        f"dataset      {dataset}: {len(episodes):,} episodes, {steps:,} steps, returns "
+        f"{min(returns):.1f} to {max(returns):.1f}, mean {np.mean(returns):.1f}"
+    )
+    return text + (f"; {dropped:,} steps found no place in equal columns" if dropped else "")
+
+
+def write_episodes(
+    episodes: Sequence[Episode], dataset_id: str, spec: EnvSpec, algorithm: str, description: str
+) -> Path:
+    """Writes episodes as a new local Minari dataset.
+
+    Args:
+      episodes: at least one.
+      dataset_id: theirs, ``"namespace/name-v0"``; lies under ``$MINARI_DATASETS_PATH`` or
+        ``~/.minari/datasets``.
+      spec: of the environment they are from.
+      algorithm: whose they are.
+      description: for people.
+
+    Returns:
+      the dataset's folder.
+
+    Raises:
+      ConfigError: Minari is not installed, the id is malformed, or there is such a dataset.
+    """
+    what = f"to={dataset_id!r}"
+    minari = minari_or_refuse(what)
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    check_dataset_id(dataset_id)
+    buffers = [
+        EpisodeBuffer(
+            id=number,
+            observations=episode.obs,
+            actions=episode.action,
+            rewards=list(episode.reward),
+            terminations=_at_the_end(episode, episode.terminated),
+            truncations=_at_the_end(episode, not episode.terminated),
+        )
+        for number, episode in enumerate(episodes)
+    ]
+    unbounded = np.full(spec.obs_size, np.inf, np.float32)
+    bounds = np.array(spec.action_low, np.float32), np.array(spec.action_high, np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # who the author is may stay open
+        minari.create_dataset_from_buffers(
+            dataset_id,
+            buffer=buffers,
+            env=None if spec.gymnasium_id is None else gymnasium.spec(spec.gymnasium_id),
+            observation_space=gymnasium.spaces.Box(-unbounded, unbounded, dtype=np.float32),
+            action_space=gymnasium.spaces.Box(*bounds, dtype=np.float32),
+            algorithm_name=algorithm,
+            description=description,
+        )
+    return Path(get_dataset_path(dataset_id))
+
+
+def check_dataset_id(dataset_id: str) -> None:
+    """Refuses an id that no new dataset can have.
+
+    Raises:
+      ConfigError: Minari is not installed, the id is malformed, or there is such a dataset.
+    """
+    what = f"to={dataset_id!r}"
+    minari_or_refuse(what)
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{what}: must be like 'name-v0' or 'namespace/name-v0'") from error
+    if get_dataset_path(dataset_id).exists():
+        raise ConfigError(f"{what}: there is such a dataset already; choose another id")
+
+
+def _at_the_end(episode: Episode, flag: bool) -> list[bool]:
+    return [False] * (len(episode) - 1) + [flag]
