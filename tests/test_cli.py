@@ -163,7 +163,7 @@ def test_describe_prints_every_field_with_its_source(run) -> None:
     preset = resolve("cpu", {"env": "Hopper"})
     for name in set(rows) - set(given):
         assert rows[name][1] == preset.sources[name]
-        assert rows[name][0] == str(preset.config.flat()[name] if name != "run_dir" else "''")
+        assert rows[name][0] == (str(preset.config.flat()[name]) or "''")
 
 
 def test_describe_json(run) -> None:
