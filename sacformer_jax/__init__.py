@@ -1,8 +1,8 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
-:func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and :class:`Devices` of many
-members on many devices, and :class:`Callback` for your own code between chunks.
+:func:`export_policy`, :func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and
+:class:`Devices` of many members on many devices, and :class:`Callback` for your own code between chunks.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
@@ -13,6 +13,7 @@ from sacformer_jax.checkpoint import CheckpointError
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs import VectorEnv, make_env
 from sacformer_jax.evaluate import make_evaluator
+from sacformer_jax.export import export_policy
 from sacformer_jax.extraction import extract
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.members import Member, seed_members
@@ -44,6 +45,7 @@ __all__ = [
     "__version__",
     "collect",
     "evaluate",
+    "export_policy",
     "extract",
     "load_policy",
     "make_env",

@@ -42,6 +42,7 @@ commands (each has --help):
   report     write an HTML page about one or several runs
   describe   print every setting and where it comes from, or a run's state
   extract    write some seeds of a run as a run of their own
+  export     write a run's policy as a file that runs without this package
 """
 
 
@@ -76,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "report": commands.report,
         "describe": _describe,
         "extract": commands.extract,
+        "export": commands.export,
     }
     if not args or args[0] in ("-h", "--help"):
         print(_USAGE, end="")

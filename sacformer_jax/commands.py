@@ -1,4 +1,4 @@
-"""The commands that look at runs: ``sacformer evaluate | report | describe | extract``."""
+"""The commands that look at runs: all but ``sacformer train`` and ``resume``."""
 
 from __future__ import annotations
 
@@ -83,6 +83,28 @@ class CollectArgs:
     """Of a run of several, which: its seed in training, or its name."""
     seed: int = 0
     """Seed of resets and samples."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportArgs:
+    """Write a run's policy as a file that runs without this package."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    to: Path
+    """The file to write; there must be none yet."""
+    format: Literal["jax", "onnx"] = "jax"
+    """A program of jax.export (extra export), or an ONNX model (extra onnx)."""
+    num_envs: int | None = None
+    """Number of environments it acts in at once; default: any."""
+    policy: Literal["best", "latest"] = "best"
+    """Which policy: best or latest."""
+    member: str | None = None
+    """Of a run of several, which: its seed in training, or its name."""
+    stochastic: bool = False
+    """Draw actions instead of taking the mean; needs num-envs."""
+    platforms: tuple[str, ...] = ("cpu", "cuda", "tpu")
+    """Of format jax: what it can run on, of cpu, cuda, rocm and tpu."""
 
 
 def evaluate(args: list[str]) -> int:
@@ -207,4 +229,22 @@ def extract(args: list[str]) -> int:
     parsed = tyro.cli(ExtractArgs, args=args, prog="sacformer extract")
     path = extraction.extract(parsed.run, parsed.members, parsed.to)
     print(f"written to {path}; continue it with: sacformer resume {path}")
+    return 0
+
+
+def export(args: list[str]) -> int:
+    """``sacformer export``."""
+    from sacformer_jax.export import export_policy
+    from sacformer_jax.policy import load_policy
+
+    parsed = tyro.cli(ExportArgs, args=args, prog="sacformer export")
+    path = export_policy(
+        load_policy(parsed.run, parsed.policy, parsed.member),
+        parsed.to,
+        format=parsed.format,
+        num_envs=parsed.num_envs,
+        deterministic=not parsed.stochastic,
+        platforms=parsed.platforms,
+    )
+    print(f"written to {path}; how to call it: docs/deploy.md")
     return 0

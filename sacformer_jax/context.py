@@ -37,7 +37,8 @@ def push(
     """
 
     def append(old: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.concatenate([old[:, 1:], new[:, None]], axis=1)  # [N, K, ...]
+        kept, new = old[:, 1:], new[:, None]
+        return jnp.concatenate([kept, new], axis=1) if kept.shape[1] else new  # [N, K, ...]
 
     return dataclasses.replace(
         context,

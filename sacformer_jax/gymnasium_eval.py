@@ -54,7 +54,11 @@ def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEv
     Raises:
       ConfigError: the environment has no Gymnasium twin, or ``episodes`` is below 1.
     """
-    return _run(gymnasium_id(policy), episodes, seed, policy.reset, policy.predict)
+
+    def predict(obs: Any, state: Any, reward: float | None) -> tuple[np.ndarray, Any]:
+        return policy.predict(obs, state, reward=reward)
+
+    return _run(gymnasium_id(policy), episodes, seed, predict)
 
 
 def evaluate_random(env_id: str, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
@@ -62,7 +66,7 @@ def evaluate_random(env_id: str, episodes: int, seed: int = 0) -> GymnasiumEvalu
     with loading_quietly(), contextlib.closing(gymnasium.make(env_id)) as env:
         space = env.action_space
     space.seed(seed)
-    return _run(env_id, episodes, seed, lambda: None, lambda obs, reward: space.sample())
+    return _run(env_id, episodes, seed, lambda obs, state, reward: (space.sample(), None))
 
 
 def gymnasium_id(policy: Policy) -> str:
@@ -82,8 +86,7 @@ def _run(
     env_id: str,
     episodes: int,
     seed: int,
-    reset: Callable[[], None],
-    predict: Callable[[Any, float], np.ndarray],
+    predict: Callable[[Any, Any, float | None], tuple[np.ndarray, Any]],
 ) -> GymnasiumEvaluation:
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
@@ -93,10 +96,12 @@ def _run(
     terms: dict[str, float] = {}
     for episode in range(episodes):
         obs, _ = env.reset(seed=seed if episode == 0 else None)
-        reset()
-        reward, done = 0.0, False
+        state: Any = None
+        reward: float | None = None
+        done = False
         while not done:
-            obs, step_reward, terminated, truncated, info = env.step(predict(obs, reward))
+            action, state = predict(obs, state, reward)
+            obs, step_reward, terminated, truncated, info = env.step(action)
             reward = float(step_reward)
             returns[episode] += reward
             lengths[episode] += 1

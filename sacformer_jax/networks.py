@@ -189,7 +189,8 @@ class TransformerActor(nn.Module):
         # All tokens of a step share its place in the band; within a step, none sees a later one.
         step_mask = banded_causal_mask(state_mask, self.context_length)
         token_mask = jnp.repeat(jnp.repeat(step_mask, n, axis=1), n, axis=2)  # [B, nT, nT]
-        token_mask &= jnp.tril(jnp.ones(token_mask.shape[1:], bool))
+        place = jnp.arange(token_mask.shape[1])
+        token_mask &= place[:, None] >= place  # by comparison: ONNX's runtime selects no booleans
         # State tokens are the second ones.
         trunk = Transformer(self.config, kept=(1, n), name="trunk")
         newest = token_mask[:, -n * states :]  # all of them, but for those of the past

@@ -164,10 +164,9 @@ def test_a_policy_object_acts_on_its_whole_episode():
     for steps in (60, 25):  # the second episode must know nothing of the first
         obs = rng.normal(size=(steps, OBS)).astype(np.float32)
         rewards = rng.normal(size=steps).astype(np.float32)
-        policy.reset()
-        actions = np.stack(
-            [policy.predict(obs[t], rewards[t - 1] if t else 0.0) for t in range(steps)]
-        )
+        acting, actions = None, np.zeros((steps, ACT), np.float32)
+        for t in range(steps):
+            actions[t], acting = policy.predict(obs[t], acting, reward=rewards[t - 1])
         expected = all_at_once(config, spec, state, obs, actions, rewards, 60)
         np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert policy._act._cache_size() == 1  # the same program, whatever the step
@@ -183,33 +182,19 @@ def test_a_policy_object_acts_in_many_environments_at_once():
     rewards = rng.normal(size=(30, 3)).astype(np.float32)
     starts = np.zeros((30, 3), bool)
     starts[12, 1] = starts[20, 1] = starts[7, 2] = True
-    policy.reset(3)
-    together = np.stack([policy.predict(obs[t], rewards[t - 1], starts[t]) for t in range(30)])
-    assert together.shape == (30, 3, ACT)
+    acting, together = None, np.zeros((30, 3, ACT), np.float32)
+    for t in range(30):
+        together[t], acting = policy.predict(obs[t], acting, starts[t], reward=rewards[t - 1])
     for env in range(3):
         for t in range(30):
-            if t == 0 or starts[t, env]:
-                policy.reset()
-            alone = policy.predict(obs[t, env], rewards[t - 1, env])
+            acting = None if t == 0 or starts[t, env] else acting
+            alone, acting = policy.predict(obs[t, env], acting, reward=rewards[t - 1, env])
             assert alone.shape == (ACT,)
             np.testing.assert_allclose(together[t, env], alone, atol=1e-5)
-    # A single environment's episodes may be told apart without a reset, too.
-    policy.reset()
-    policy.predict(obs[0, 0])
-    np.testing.assert_allclose(
-        policy.predict(obs[7, 2], 5.0, episode_start=True), together[7, 2], atol=1e-5
-    )
-    with pytest.raises(ValueError, match="num_envs=0: must be at least 1"):
-        policy.reset(0)
-    policy.reset(3)
-    for arguments, message in (
-        ((obs[0, 0],), r"obs of shape \(3,\): must be \(3, 3\); reset"),
-        ((obs[0, :2],), r"obs of shape \(2, 3\): must be \(3, 3\)$"),
-        ((obs[0], np.zeros(2)), r"reward of shape \(2,\): must be \(3,\), or a scalar"),
-        ((obs[0], 0.0, [True]), r"episode_start of shape \(1,\): must be \(3,\), or a scalar"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            policy.predict(*arguments)
+    # A single environment's episodes may be told apart by the flag, too.
+    _, acting = policy.predict(obs[0, 0])
+    action, _ = policy.predict(obs[7, 2], acting, episode_start=True, reward=5.0)
+    np.testing.assert_allclose(action, together[7, 2], atol=1e-5)
 
 
 class HurriedEnv(PointEnv):
@@ -284,7 +269,9 @@ def test_the_cache_keeps_bfloat16_products_in_bfloat16():
     assert all(x.dtype == jnp.bfloat16 for x in jax.tree.leaves(agent.init_cache(2)))
     obs = np.random.default_rng(0).normal(size=(30, OBS)).astype(np.float32)
     rewards, policy = np.ones(30, np.float32), Policy(config, spec, agent, state)
-    actions = np.stack([policy.predict(obs[t], rewards[t]) for t in range(30)])
+    acting, actions = None, np.zeros((30, ACT), np.float32)
+    for t in range(30):
+        actions[t], acting = policy.predict(obs[t], acting, reward=rewards[t])
     expected = all_at_once(config, spec, state, obs, actions, rewards, 30)  # in float32
     np.testing.assert_allclose(actions, expected, atol=0.05)
     assert np.abs(actions - expected).max() > 1e-4
@@ -308,7 +295,7 @@ def test_dropout_in_acting_is_drawn_from_the_key(acting_context):
     np.testing.assert_array_equal(mean_action(plain, 0), mean_action(plain, 1))
 
 
-def test_a_policy_with_dropout_draws_anew_at_every_step_and_repeats_after_reset():
+def test_a_policy_with_dropout_draws_anew_at_every_step_and_repeats_in_each_episode():
     config = acting_config(acting_context="window", acting_dropout=True, actor_dropout=0.4)
     agent, spec, state = make_agent(config, 30)
     policy = Policy(config, spec, agent, state)
@@ -322,9 +309,12 @@ def test_a_policy_with_dropout_draws_anew_at_every_step_and_repeats_after_reset(
     second, stale = (act(state, context, k, explore=False) for k in (second_key, first_key))
     assert np.abs(second.action - stale.action).max() > 1e-3
     for _ in range(2):
+        acting = None
         for acted in (first, second):
-            np.testing.assert_allclose(policy.predict(obs[0]), acted.action[0], atol=1e-5)
-        policy.reset()
+            action, acting = policy.predict(obs[0], acting, reward=0.0)
+            np.testing.assert_allclose(action, acted.action[0], atol=1e-5)
+    other, _ = policy.predict(obs[0], policy.initial_state(seed=1))
+    assert np.abs(other - first.action[0]).max() > 1e-3
 
 
 def test_evaluation_draws_its_dropout_from_its_key_at_every_step():

@@ -104,5 +104,5 @@ def test_a_run_from_the_command_line(tmp_path: Path) -> None:
     for record in records:
         for name in ("critic_loss", "actor_loss", "q_mean", "critic_grad_norm", "actor_grad_norm"):
             assert np.isfinite(record[name]), name
-    action = load_policy(tmp_path / "run").predict(np.zeros(11, np.float32))
+    action, _ = load_policy(tmp_path / "run").predict(np.zeros(11, np.float32))
     assert action.shape == (3,)

@@ -116,7 +116,7 @@ def test_saved_on_eight_devices_and_restored_on_one(on_eight: Path, tmp_path: Pa
     ]  # fmt: skip
     obs = np.zeros(11, np.float32)
     for seed in (0, 1):  # a policy saved there acts here
-        assert np.isfinite(load_policy(on_eight, "latest", seed).predict(obs)).all()
+        assert np.isfinite(load_policy(on_eight, "latest", seed).predict(obs)[0]).all()
 
 
 def test_the_data_may_be_split_otherwise_on_the_way(stopped: Path, tmp_path: Path) -> None:

@@ -808,15 +808,15 @@ def test_an_exported_policy_is_the_mean_within_the_bounds(tmp_path: Path) -> Non
     path = train(Config.from_preset("cpu", **TINY, run_dir=str(tmp_path / "run")), quiet=True).path
     policy = load_policy(path, "latest")
     obs = np.random.default_rng(0).normal(size=(5, 11)).astype(np.float32)
-    policy.reset(5)
-    action = policy.predict(obs)
+    action, acting = policy.predict(obs)
     statistics = policy.state.normalizer
     assert int(statistics.count) == 256
     std = np.sqrt(np.maximum(statistics.m2 / statistics.count, 1e-8))
     seen = np.clip((obs - statistics.mean) / std, -10, 10)
     mean = _forward(policy.state.actor_params, seen, "mean")
     np.testing.assert_allclose(action, np.clip(mean, -1, 1), rtol=1e-4, atol=1e-5)
-    np.testing.assert_array_equal(policy.predict(obs), action)  # nothing is remembered
+    again, _ = policy.predict(obs, acting)  # no reward is asked for, and nothing remembered
+    np.testing.assert_array_equal(again, action)
     records = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
     assert {*METRICS, "kind", "env_steps", "updates"} == set(
         next(record for record in records if record["kind"] == "train")

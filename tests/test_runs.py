@@ -367,14 +367,14 @@ def _observations(count: int) -> np.ndarray:
 
 def _predictions(policy: Policy, observations: np.ndarray, rewards: np.ndarray) -> np.ndarray:
     """Actions of an episode; ``rewards[i]`` is what step ``i`` gave."""
-    policy.reset()
-    before = [0.0, *rewards[:-1]]
-    return np.stack(
-        [policy.predict(obs, reward) for obs, reward in zip(observations, before, strict=True)]
-    )
+    state, actions = None, []
+    for obs, reward in zip(observations, [0.0, *rewards[:-1]], strict=True):
+        action, state = policy.predict(obs, state, reward=reward)
+        actions.append(action)
+    return np.stack(actions)
 
 
-def test_predict_is_within_bounds_and_repeats_after_reset(policy: Policy) -> None:
+def test_predict_is_within_bounds_and_repeats(policy: Policy) -> None:
     observations, rewards = 10 * _observations(9), np.linspace(-5, 5, 9)
     actions = _predictions(policy, observations, rewards)
     assert actions.shape == (9, 3)
@@ -385,16 +385,14 @@ def test_predict_is_within_bounds_and_repeats_after_reset(policy: Policy) -> Non
     np.testing.assert_array_equal(_predictions(policy, observations, rewards), actions)
 
 
-def test_predict_ignores_the_reward_only_after_reset(policy: Policy) -> None:
+def test_predict_ignores_the_reward_only_where_an_episode_starts(policy: Policy) -> None:
     first, second = _observations(2)
-    policy.reset()
-    action = policy.predict(first)
-    policy.reset()
-    np.testing.assert_array_equal(policy.predict(first, 1e6), action)
-    after_one = policy.predict(second, 1.0)
-    policy.reset()
-    policy.predict(first)
-    assert not np.array_equal(policy.predict(second, 1e3), after_one)
+    action, state = policy.predict(first)
+    np.testing.assert_array_equal(policy.predict(first, reward=1e6)[0], action)
+    started, _ = policy.predict(first, state, episode_start=True, reward=1e6)
+    np.testing.assert_array_equal(started, action)
+    after_one, _ = policy.predict(second, state, reward=1.0)
+    assert not np.array_equal(policy.predict(second, state, reward=1e3)[0], after_one)
 
 
 def _context_by_hand(
@@ -439,19 +437,11 @@ def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, tokens: s
         assert np.allclose(forgotten, expected, atol=1e-6) == (tokens == "gs" or steps == 1)
 
 
-@pytest.mark.parametrize("shape", [(10,), (12,), (1, 11), ()], ids=str)
-def test_an_observation_of_another_shape_is_refused(policy: Policy, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"must be \(11,\)") as refused:
-        policy.predict(np.zeros(shape, np.float32))
-    assert str(shape) in str(refused.value)
-
-
 def test_the_latest_policy_acts_too(straight: Outcome, policy: Policy) -> None:
     latest = load_policy(straight.result.path, "latest")
     observation = _observations(1)[0]
-    policy.reset()
     best_is_latest = digest(latest.state) == digest(policy.state)
-    same = np.array_equal(latest.predict(observation), policy.predict(observation))
+    same = np.array_equal(latest.predict(observation)[0], policy.predict(observation)[0])
     assert same == best_is_latest
 
 

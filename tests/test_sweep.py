@@ -246,7 +246,8 @@ def test_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert load_policy(best.path, member="0").config.learning.tau == float(table[0]["tau"])
     # What was the best before is kept.
     before = load_policy(path / "best-setting-before-1", member="0")
-    assert np.array_equal(before.predict(np.ones(11)), first.predict(np.ones(11)))
+    actions = [policy.predict(np.ones(11))[0] for policy in (before, first)]
+    assert np.array_equal(*actions)
 
     assert sweep.main(flags(path, *asked)) == 0
     assert "has done its 400 env steps already" in capsys.readouterr().out
