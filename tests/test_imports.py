@@ -45,7 +45,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("policy", "collecting", "results", "signals", "fault_report"),
     ("callbacks",),
     ("tracking",),
-    ("acting_step", "gymnasium_eval", "loop"),
+    ("acting_step", "gymnasium_eval", "loop", "reward_in_obs"),
     ("onnx_export",),
     ("export", "extraction", "runner", "report"),
     ("api",),
