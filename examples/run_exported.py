@@ -14,7 +14,7 @@ import numpy as np
 
 
 def load(path, num_envs=1):
-    """``action, state = step(obs, state, episode_start, reward)``, the first state, the manifest."""
+    """``action, state = step(obs, state, episode_start, reward)``; a first state; the manifest."""
     with zipfile.ZipFile(path) as archive:
         manifest = json.loads(archive.read("manifest.json"))
         if (manifest["format"], manifest["format_version"]) != ("sacformer-policy", 1):
