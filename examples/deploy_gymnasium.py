@@ -7,6 +7,7 @@ import argparse
 import gymnasium
 
 from sacformer_jax import Policy, load_policy
+from sacformer_jax.gymnasium_eval import gymnasium_id
 
 
 def play(policy: Policy, env: gymnasium.Env, episodes: int, seed: int = 0) -> list[float]:
@@ -14,11 +15,12 @@ def play(policy: Policy, env: gymnasium.Env, episodes: int, seed: int = 0) -> li
     returns = []
     for episode in range(episodes):
         obs, _ = env.reset(seed=seed if episode == 0 else None)
-        state, reward, total, done = None, None, 0.0, False  # state=None: a new episode begins
+        state, reward, total, done = None, 0.0, 0.0, False  # state=None: a new episode begins
         while not done:
             action, state = policy.predict(obs, state, reward=reward)
-            obs, reward, terminated, truncated, _ = env.step(action)
-            total += float(reward)
+            obs, step_reward, terminated, truncated, _ = env.step(action)
+            reward = float(step_reward)
+            total += reward
             done = terminated or truncated
         returns.append(total)
     return returns
@@ -30,5 +32,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=3)
     args = parser.parse_args()
     trained = load_policy(args.run)
-    for value in play(trained, gymnasium.make(trained.spec.gymnasium_id), args.episodes):
+    for value in play(trained, gymnasium.make(gymnasium_id(trained)), args.episodes):
         print(f"return {value:.1f}")

@@ -7,13 +7,15 @@ policy's Gymnasium task: ``python examples/run_exported.py policy.zip``.
 import json
 import sys
 import zipfile
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 
-def load(path, num_envs=1):
+def load(path: str, num_envs: int = 1) -> tuple[Callable[..., Any], dict[str, Any], dict[str, Any]]:
     """``action, state = step(obs, state, episode_start, reward)``; a first state; the manifest."""
     with zipfile.ZipFile(path) as archive:
         manifest = json.loads(archive.read("manifest.json"))
@@ -40,6 +42,7 @@ if __name__ == "__main__":
         action, state = step(
             np.array([obs], np.float32), state, np.array([start]), np.array([reward], np.float32)
         )
-        obs, reward, terminated, truncated, _ = env.step(np.asarray(action[0]))
-        total, start, done = total + reward, False, terminated or truncated
+        obs, step_reward, terminated, truncated, _ = env.step(np.asarray(action[0]))
+        reward, start, done = float(step_reward), False, terminated or truncated
+        total += reward
     print(f"return {total:.1f}")

@@ -2,7 +2,8 @@
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
 :func:`export_policy`, :func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and
-:class:`Devices` of many members on many devices, and :class:`Callback` for your own code between chunks.
+:class:`Devices` of many members on many devices, and :class:`Callback` for your own code between
+chunks.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
