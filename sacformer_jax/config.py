@@ -40,19 +40,21 @@ class TaskConfig:
     """What is learnt."""
 
     env: str = "HalfCheetah"
-    """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, or brax:NAME."""
+    """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, brax:NAME, playground:NAME or gym:ID."""
     engine: EngineName = "auto"
     """Physics engine of the MuJoCo tasks: C MuJoCo (native), MuJoCo in JAX (mjx), or by device."""
     mjx_preset: MjxPreset = "parity"
     """Solver of engine mjx: as in Gymnasium's models (parity), or few iterations (fast)."""
     mjx_impl: MjxImpl = "jax"
-    """Implementation of engine mjx; warp needs an NVIDIA GPU and the package warp-lang."""
+    """Implementation of engine mjx and of playground:NAME; warp needs an NVIDIA GPU and the package
+    warp-lang."""
     brax_backend: BraxBackend = "spring"
     """Physics backend of brax:NAME tasks."""
     num_envs: int = 1
     """Environments stepped side by side."""
     max_episode_steps: int = 1000
-    """Time limit of an episode, in environment steps (truncation, not termination)."""
+    """Time limit of an episode, in environment steps (truncation, not termination); by default of
+    gym:ID and playground:NAME their own."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,7 @@ every value is kept, so that ``sacformer describe`` can print it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from sacformer_jax.config import Config, ConfigError
@@ -36,6 +37,11 @@ class Resolved:
 
     config: Config
     sources: dict[str, str]
+
+
+TASK_LAYERS: dict[str, Callable[[str, dict[str, Any]], tuple[Layer, ...]]] = {}
+"""By the prefix of an environment's name, what is known of such tasks beside the presets: takes the
+name after the prefix and the values given by the user. :mod:`sacformer_jax.envs` fills it."""
 
 
 # A good SAC policy's return at 1 M steps: rounded from published tables (SB3 zoo, Tianshou).
@@ -186,7 +192,7 @@ PRESETS: dict[str, tuple[Layer, ...]] = {
 
 
 def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolved:
-    """Lays the preset's layers and then ``fields`` over the defaults.
+    """Lays the preset's layers, the task's own and then ``fields`` over the defaults.
 
     Args:
       preset: a key of :data:`PRESETS`.
@@ -194,7 +200,8 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
       given: the source to record for them.
 
     Raises:
-      ConfigError: an unknown preset or field, or a value of the wrong type.
+      ConfigError: an unknown preset or field, or a value of the wrong type; there is no such
+        environment where its own settings are to be looked up.
     """
     if preset not in PRESETS:
         raise ConfigError(f"preset={preset!r}: must be one of {', '.join(PRESETS)}")
@@ -204,7 +211,7 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
     chosen = config.replace(**{k: v for k, v in fields.items() if k in ("agent", "env")})
     layers = [
         layer
-        for layer in PRESETS[preset]
+        for layer in (*PRESETS[preset], *_task_layers(chosen.task.env, fields))
         if layer.agent in (None, chosen.agent) and layer.env in (None, chosen.task.env)
     ]
     if fields.get("dataset"):
@@ -213,3 +220,10 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
         config = config.replace(**layer.values)
         sources.update(dict.fromkeys(layer.values, layer.source))
     return Resolved(config, sources)
+
+
+def _task_layers(env: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    for prefix, layers_of in TASK_LAYERS.items():
+        if env.startswith(prefix):
+            return layers_of(env.removeprefix(prefix), fields)
+    return ()

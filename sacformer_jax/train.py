@@ -97,7 +97,14 @@ def make_training_env(
 ) -> VectorEnv:
     """The configuration's environment, vectorized; ``num_envs`` other than its own if given."""
     task = config.task
-    env = make_env(task.env, task.engine, task.brax_backend, task.mjx_preset, task.mjx_impl)
+    env = make_env(
+        task.env,
+        task.engine,
+        task.brax_backend,
+        task.mjx_preset,
+        task.mjx_impl,
+        task.max_episode_steps,
+    )
     num_envs = task.num_envs if num_envs is None else num_envs
     return VectorEnv(env, num_envs, task.max_episode_steps, data)
 

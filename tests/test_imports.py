@@ -76,8 +76,11 @@ OUTSIDE = {
 }  # fmt: skip
 ALLOWED = {
     "cores": {"os"},  # which cores there are
+    "envs.gym_host": {"gymnasium", "threading", "warnings"},  # the environments are Gymnasium's
+    "envs.gym_registry": {"gymnasium", "importlib"},
     "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files
+    "envs.playground_env": {"importlib", "subprocess"},  # an extra, which runs git
     "envs.mjx_engine": {"threading"},  # MJX's table of collisions is the process's
 }
 DIRTY_CALLS = {"print", "open", "input", "breakpoint", "exec", "eval"}

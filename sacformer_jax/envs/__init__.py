@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import Env, EnvSpec, EnvStep, VectorEnv, VectorEnvState, VectorStep
 from sacformer_jax.envs.physics import ENGINES, EngineChoice
 from sacformer_jax.envs.tasks import TASKS
+from sacformer_jax.presets import TASK_LAYERS, Layer
 
-BRAX_PREFIX = "brax:"
+BRAX_PREFIX, GYM_PREFIX, PLAYGROUND_PREFIX = "brax:", "gym:", "playground:"
 
 __all__ = [
     "ENGINES",
@@ -29,17 +32,22 @@ def make_env(
     brax_backend: str = "spring",
     mjx_preset: str = "parity",
     mjx_impl: str = "jax",
+    max_episode_steps: int | None = None,
 ) -> Env:
     """Makes an environment by name.
 
     Args:
-      name: a MuJoCo task (``"HalfCheetah"``, …) or ``"brax:NAME"`` for any environment of
-        ``brax.envs`` (``"brax:ant"``).
+      name: a MuJoCo task (``"HalfCheetah"``, …), ``"brax:NAME"`` for any environment of
+        ``brax.envs`` (``"brax:ant"``), ``"playground:NAME"`` for a task of MuJoCo Playground
+        (``"playground:CheetahRun"``) or ``"gym:ID"`` for one of Gymnasium's registry
+        (``"gym:Pendulum-v1"``).
       engine: physics engine of the MuJoCo tasks: ``"native"`` (C MuJoCo on the host), ``"mjx"``
         (MuJoCo in JAX, on the device) or ``"auto"`` (native on CPU, mjx on accelerators).
       brax_backend: ``"spring"``, ``"positional"``, ``"generalized"`` or ``"mjx"``.
       mjx_preset: solver of engine mjx: ``"parity"`` (as in the models) or ``"fast"``.
       mjx_impl: ``"jax"``, or ``"warp"`` on NVIDIA.
+      max_episode_steps: of ``gym:ID``, the longest episode that is wanted; default: its own time
+        limit.
 
     Raises:
       ConfigError: an unknown name (the message lists what exists), engine or backend.
@@ -48,11 +56,38 @@ def make_env(
         from sacformer_jax.envs.brax_env import BraxEnv
 
         return BraxEnv(name.removeprefix(BRAX_PREFIX), brax_backend)
+    if name.startswith(PLAYGROUND_PREFIX):
+        from sacformer_jax.envs.playground_env import PlaygroundEnv
+
+        return PlaygroundEnv(name.removeprefix(PLAYGROUND_PREFIX), mjx_impl)
+    if name.startswith(GYM_PREFIX):
+        from sacformer_jax.envs.gym_env import GymEnv
+
+        return GymEnv(name.removeprefix(GYM_PREFIX), max_episode_steps)
     if name not in TASKS:
         from sacformer_jax.envs.brax_env import brax_names
 
         known = [*TASKS, *(BRAX_PREFIX + brax_name for brax_name in brax_names())]
-        raise ConfigError(f"env={name!r}: no such environment; there are {', '.join(known)}")
+        raise ConfigError(
+            f"env={name!r}: no such environment; there are {', '.join(known)}, "
+            f"{PLAYGROUND_PREFIX}NAME and {GYM_PREFIX}ID"
+        )
     from sacformer_jax.envs.mujoco_env import MujocoEnv
 
     return MujocoEnv(name, EngineChoice(engine, mjx_preset, mjx_impl))
+
+
+def _gym_layers(env_id: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    from sacformer_jax.envs.gym_registry import task_layers
+
+    return task_layers(env_id, fields)
+
+
+def _playground_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    from sacformer_jax.envs.playground_env import task_layers
+
+    return task_layers(name, fields)
+
+
+TASK_LAYERS[GYM_PREFIX] = _gym_layers
+TASK_LAYERS[PLAYGROUND_PREFIX] = _playground_layers

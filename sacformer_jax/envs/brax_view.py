@@ -55,7 +55,7 @@ class BraxView(brax_envs.Env):
             pipeline_state=env_state,
             obs=jnp.where(bad, state.obs, step.obs),
             reward=jnp.where(bad, 0.0, step.reward),
-            done=(step.terminated | bad).astype(jnp.float32),
+            done=(step.terminated | step.truncated | bad).astype(jnp.float32),
             metrics={**state.metrics, **terms, "bad_physics": bad.astype(jnp.float32)},
         )
 

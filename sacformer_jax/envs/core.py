@@ -59,6 +59,8 @@ class EnvStep:
       terminated: bool, the task ended (value 0 afterwards). Time limits are not known here.
       bad: bool, the physics broke down: the other values are meaningless.
       reward_terms: named parts of the reward (may be empty).
+      truncated: bool, the environment cut the episode off by itself, for another reason than the
+        time limit; False where it is not given.
     """
 
     obs: jax.Array
@@ -66,6 +68,7 @@ class EnvStep:
     terminated: jax.Array
     bad: jax.Array
     reward_terms: dict[str, jax.Array]
+    truncated: jax.Array = flax.struct.field(default_factory=lambda: jnp.zeros((), bool))
 
 
 class Env(Protocol):
@@ -172,7 +175,7 @@ class VectorStep:
       obs: ``[N, O]``, the final observation where an episode ended, *before* the reset.
       reward: ``[N]`` float32, 0 where ``bad``.
       terminated: bool ``[N]``, the task ended.
-      truncated: bool ``[N]``, cut off by the time limit or by bad physics.
+      truncated: bool ``[N]``, cut off by the time limit, the environment itself or bad physics.
       bad: bool ``[N]``, bad physics: this transition must not be learnt from; ``obs`` repeats the
         last good observation.
       next_obs: ``[N, O]``, the observation to act on next (after the reset where one happened).
@@ -226,6 +229,12 @@ class VectorEnv:
         limit = env.spec.max_episode_steps if max_episode_steps is None else max_episode_steps
         if limit < 1:
             raise ConfigError(f"max_episode_steps={limit}: must be at least 1")
+        longest = getattr(env, "longest_episode", limit)  # where its states have only so much room
+        if limit > longest:
+            raise ConfigError(
+                f"max_episode_steps={limit}: this {env.spec.name} was made for at most {longest}; "
+                f"give make_env the same max_episode_steps={limit}"
+            )
         self.env = env
         self.data, self.num_envs = data, num_envs // data.size
         self.max_episode_steps = limit
@@ -253,7 +262,8 @@ class VectorEnv:
         bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
         time_step = state.time_step + 1
         terminated = step.terminated & ~bad
-        truncated = bad | (~terminated & (time_step >= self.max_episode_steps))
+        cut_off = step.truncated | (time_step >= self.max_episode_steps)
+        truncated = bad | (~terminated & cut_off)
         done = terminated | truncated
         obs = jnp.where(bad[:, None], state.obs, step.obs)
         next_env, next_obs = where_tree(done, prepared, (env_state, obs))

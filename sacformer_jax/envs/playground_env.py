@@ -1,0 +1,183 @@
+"""Tasks of MuJoCo Playground (extra ``playground``) under our contract.
+
+Playground's own wrapper starts every episode of an environment from the first state it had; here
+resets are those of the contract, random each time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import importlib
+import subprocess
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.core import EnvSpec, EnvStep, JaxEnv
+from sacformer_jax.presets import Layer
+
+
+def _playground() -> ModuleType:
+    """The package.
+
+    Raises:
+      ConfigError: it is not installed.
+    """
+    try:
+        with contextlib.redirect_stdout(None):  # warp prints where it is
+            return importlib.import_module("mujoco_playground")
+    except ImportError as error:
+        raise ConfigError(
+            f"env='playground:…': needs MuJoCo Playground ({error}): "
+            'pip install "sacformer-jax[playground]"'
+        ) from error
+
+
+def playground_names() -> list[str]:
+    """Names of Playground's tasks, those registered by the user among them.
+
+    Raises:
+      ConfigError: Playground is not installed.
+    """
+    package = _playground()
+    suites = (package.dm_control_suite, package.locomotion, package.manipulation)
+    return sorted(name for suite in suites for name in suite.ALL_ENVS)
+
+
+def task_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    """Settings that Playground knows better than our defaults.
+
+    Raises:
+      ConfigError: Playground is not installed or has no such task.
+    """
+    limit = _time_limit(_default_config(name))
+    layers = [Layer("the task's own episode length", {"max_episode_steps": limit})]
+    if name in _playground().dm_control_suite.ALL_ENVS:
+        # Rewards are at most 1 there, whatever the task.
+        values = {"target_return": float(limit), "return_scale": limit / 10}
+        layers.append(Layer("the highest return there is, and a tenth of it", values))
+    elif fields.get("return_conditioning") != "none":
+        why = "no target is known: the best return so far, or 0"
+        layers.append(Layer(why, {"target_return": "auto"}, agent="sacformer"))
+    return tuple(layers)
+
+
+class PlaygroundEnv(JaxEnv):
+    """A Playground environment. Its ``done`` is a termination; the time limit is ours.
+
+    The parts of the reward are those of its metrics whose names begin with ``reward``. Where its
+    configuration has an ``action_repeat``, a step of ours is as many of its own.
+
+    Args:
+      name: Playground's name, e.g. ``"CheetahRun"``.
+      mjx_impl: implementation of MJX: ``"jax"``, or ``"warp"`` on NVIDIA.
+
+    Raises:
+      ConfigError: Playground or the task's robot is not there, there is no such task, its
+        observations are not one vector, or this machine cannot have ``mjx_impl``.
+    """
+
+    def __init__(self, name: str, mjx_impl: str = "jax"):
+        config = _default_config(name)
+        _check_impl(mjx_impl)
+        overrides = {"impl": mjx_impl} if "impl" in config else {}
+        self._env = _load(name, overrides)
+        self._action_repeat = int(config.get("action_repeat", 1))
+        size = int(self._env.action_size)
+        state = jax.eval_shape(self._env.reset, jax.random.key(0))
+        self.spec = EnvSpec(
+            name=f"playground:{name}",
+            obs_size=_checked_obs_size(
+                name, jax.eval_shape(self._env.reset, jax.random.key(0)).obs
+            ),
+            action_size=size,
+            action_low=(-1.0,) * size,  # as Playground's own training bounds them
+            action_high=(1.0,) * size,
+            max_episode_steps=_time_limit(config),
+            engine=f"mjx {mjx_impl}",
+            engine_reason="as Playground has it",
+        )
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        state = self._env.reset(key)
+        return state, state.obs
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
+        def once(state: Any, _: None) -> tuple[Any, tuple[jax.Array, dict[str, jax.Array]]]:
+            state = self._env.step(state, action)
+            terms = {k: v for k, v in state.metrics.items() if k.startswith("reward")}
+            return state, (state.reward, terms)
+
+        state, (rewards, terms) = jax.lax.scan(once, state, length=self._action_repeat)
+        qpos, qvel = state.data.qpos, state.data.qvel
+        step = EnvStep(
+            obs=state.obs,
+            reward=rewards.sum(),
+            terminated=state.done > 0.5,
+            # Their done says this, too, but it is not an end of the task.
+            bad=~(jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()),
+            reward_terms=jax.tree.map(lambda term: term.sum(), terms),
+        )
+        return state, step
+
+
+def _default_config(name: str) -> Any:
+    names = playground_names()
+    if name not in names:
+        close = difflib.get_close_matches(name, names, n=5)
+        what = f"close ones are {', '.join(close)}" if close else f"there are {', '.join(names)}"
+        raise ConfigError(f"env='playground:{name}': no such task; {what}")
+    return _playground().registry.get_default_config(name)
+
+
+def _time_limit(config: Any) -> int:
+    """In steps of ours."""
+    return -(-int(config.episode_length) // int(config.get("action_repeat", 1)))
+
+
+def _load(name: str, overrides: dict[str, str]) -> Any:
+    package = _playground()
+    try:
+        with contextlib.redirect_stdout(None):
+            return package.registry.load(name, config_overrides=overrides)
+    except (OSError, subprocess.SubprocessError) as error:
+        if name in package.dm_control_suite.ALL_ENVS:
+            raise
+        from mujoco_playground._src import mjx_env
+
+        raise ConfigError(
+            f"env='playground:{name}': its robot is of mujoco_menagerie, which Playground clones "
+            f"at first use, and that failed: {error}; without a network, put a checkout of "
+            f"https://github.com/google-deepmind/mujoco_menagerie at {mjx_env.MENAGERIE_PATH} "
+            f"(commit {mjx_env.MENAGERIE_COMMIT_SHA}), or take a task of the DM control suite"
+        ) from error
+
+
+def _checked_obs_size(name: str, obs: Any) -> int:
+    if isinstance(obs, Mapping):
+        shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in obs.items())
+        raise ConfigError(
+            f"env='playground:{name}': observations are a dictionary ({shapes}); what can be taken "
+            "is one vector"
+        )
+    if len(obs.shape) != 1:
+        raise ConfigError(
+            f"env='playground:{name}': observations have shape {obs.shape}; what can be taken is "
+            "one vector"
+        )
+    return int(obs.shape[0])
+
+
+def _check_impl(mjx_impl: str) -> None:
+    if mjx_impl not in ("jax", "warp"):
+        raise ConfigError(f"mjx_impl={mjx_impl!r}: must be one of jax, warp")
+    if mjx_impl == "warp" and jax.default_backend() != "gpu":
+        raise ConfigError(
+            f"mjx_impl='warp': needs an NVIDIA GPU, JAX's backend is {jax.default_backend()}; "
+            "use mjx_impl=jax"
+        )
