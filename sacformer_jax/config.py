@@ -46,8 +46,7 @@ class TaskConfig:
     mjx_preset: MjxPreset = "parity"
     """Solver of engine mjx: as in Gymnasium's models (parity), or few iterations (fast)."""
     mjx_impl: MjxImpl = "jax"
-    """Implementation of engine mjx and of playground:NAME; warp needs an NVIDIA GPU and the package
-    warp-lang."""
+    """Implementation of engine mjx; warp needs an NVIDIA GPU and the package warp-lang."""
     brax_backend: BraxBackend = "spring"
     """Physics backend of brax:NAME tasks."""
     num_envs: int = 1

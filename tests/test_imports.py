@@ -77,6 +77,7 @@ OUTSIDE = {
 ALLOWED = {
     "cores": {"os"},  # which cores there are
     "envs.gym_host": {"gymnasium", "threading", "warnings"},  # the environments are Gymnasium's
+    "envs.gym_live": {"gymnasium"},
     "envs.gym_registry": {"gymnasium", "importlib"},
     "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files

@@ -19,8 +19,9 @@ class BraxView(brax_envs.Env):
     Brax's wrappers (``brax.envs.training.wrap``) add vectorization, episodes and resets; give them
     ``episode_length=env.spec.max_episode_steps``. Brax's agents act in the unit box, so actions are
     scaled from there to the task's bounds. Brax knows one kind of ``done`` besides its own time
-    limit, so a step of bad physics ends the episode like a termination; it has reward 0 and the
-    observation before it, and is counted in ``metrics["bad_physics"]``.
+    limit, so what an environment truncates by itself ends like a termination. So does a step of bad
+    physics; it has reward 0 and the observation before it, and is counted in
+    ``metrics["bad_physics"]``.
 
     Args:
       env: one of ours, e.g. ``make_env("HalfCheetah", "native")``.

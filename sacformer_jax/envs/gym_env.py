@@ -21,7 +21,8 @@ import jax.numpy as jnp
 
 from sacformer_jax.envs import gym_registry
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
-from sacformer_jax.envs.gym_host import TOKEN_WORDS, GymHost
+from sacformer_jax.envs.gym_host import GymHost
+from sacformer_jax.envs.gym_live import TOKEN_WORDS
 from sacformer_jax.envs.gym_registry import Found
 from sacformer_jax.envs.host_call import HostCall
 from sacformer_jax.parallel import any_of_all

@@ -10,7 +10,6 @@ brought there by doing the episode again, and the token tells whether it went th
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import math
 import threading
@@ -21,124 +20,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from sacformer_jax.envs.native import loading_quietly
-
-TOKEN_WORDS = 4
-_TOKEN_BYTES = 4 * TOKEN_WORDS
-# Live environments kept, over the largest batch: of training those running and those prepared, and
-# as many of evaluation.
-_KEPT = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class GymFacts:
-    """What the host knows of an environment.
-
-    Attributes:
-      env_id: the id it is registered under.
-      obs_size: O.
-      action_size: A.
-      action_dtype: type of its actions.
-      reward_terms: names in ``info`` that are parts of the reward, R of them.
-      max_steps: T, steps of the longest episode.
-    """
-
-    env_id: str
-    obs_size: int
-    action_size: int
-    action_dtype: np.dtype
-    reward_terms: tuple[str, ...]
-    max_steps: int
-
-    @property
-    def row_size(self) -> int:
-        """Words of an :class:`Outcome`: token, O, reward, three flags, R."""
-        return TOKEN_WORDS + self.obs_size + 4 + len(self.reward_terms)
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What a reset or a step gave.
-
-    Attributes:
-      token: of the state after it, 16 bytes.
-      obs: ``[O]`` float32.
-      reward: as float32 holds it.
-      terminated: the task ended.
-      truncated: the environment cut the episode off by itself.
-      terms: ``[R]`` float32 parts of the reward; 0 where ``info`` has none.
-    """
-
-    token: bytes
-    obs: np.ndarray
-    reward: np.float32
-    terminated: bool
-    truncated: bool
-    terms: np.ndarray
-
-    def write(self, row: np.ndarray) -> None:
-        """Into a row ``[row_size]`` of uint32."""
-        row[:TOKEN_WORDS] = np.frombuffer(self.token, np.uint32)
-        numbers = row[TOKEN_WORDS:].view(np.float32)
-        end = self.obs.size
-        numbers[:end] = self.obs
-        numbers[end : end + 3] = self.reward, self.terminated, self.truncated
-        numbers[end + 4 :] = self.terms
-
-
-def make(env_id: str) -> gymnasium.Env:
-    """``gymnasium.make`` without the time limit, which is the vector environment's to set."""
-    with loading_quietly():
-        return gymnasium.make(env_id, max_episode_steps=-1, disable_env_checker=True)
-
-
-class LiveEnvs:
-    """Environments by the token of the state they are in, and those in none.
-
-    Args:
-      first: one to begin with.
-      env_id: what more of them are made from.
-    """
-
-    def __init__(self, first: gymnasium.Env, env_id: str):
-        self.env_id, self.made, self.capacity = env_id, 1, 0
-        self._idle = [first]
-        self._by_token: dict[bytes, gymnasium.Env] = {}  # in the order of their last step
-
-    def take(self, token: bytes) -> gymnasium.Env | None:
-        """The one in that state, if there is one."""
-        return self._by_token.pop(token, None)
-
-    def spare(self) -> gymnasium.Env:
-        """Any that may be reset: an idle one, a new one, or the one longest not used."""
-        if self._idle:
-            return self._idle.pop()
-        if self.made >= self.capacity and self._by_token:
-            return self._by_token.pop(next(iter(self._by_token)))
-        self.made += 1
-        return make(self.env_id)
-
-    def keep(self, token: bytes, env: gymnasium.Env) -> None:
-        """Keeps one under the token of its state."""
-        other = self._by_token.pop(token, None)
-        if other is not None:
-            self._idle.append(other)
-        self._by_token[token] = env
-
-    def release(self, env: gymnasium.Env) -> None:
-        """Its episode is over."""
-        self._idle.append(env)
-
-    @contextlib.contextmanager
-    def dropped_on_error(self, env: gymnasium.Env) -> Iterator[None]:
-        """Around what an environment does: after an exception it is in no state to go on."""
-        try:
-            yield
-        except BaseException:
-            self.made -= 1
-            with contextlib.suppress(Exception):
-                env.close()
-            raise
+from sacformer_jax.envs.gym_live import TOKEN_BYTES, TOKEN_WORDS, GymFacts, LiveEnvs, Outcome
 
 
 class GymHost:
@@ -149,14 +31,14 @@ class GymHost:
       first: one of the environments.
 
     Attributes:
-      calls: host calls so far.
+      live: the environments there are.
       replayed: steps done again so far.
     """
 
     def __init__(self, facts: GymFacts, first: gymnasium.Env):
         self.facts = facts
-        self.calls = self.replayed = 0
-        self._live = LiveEnvs(first, facts.env_id)
+        self.replayed = 0
+        self.live = LiveEnvs(first, facts)
         self._lock = threading.Lock()  # programs at once take turns
         self._warned = False
 
@@ -221,47 +103,47 @@ class GymHost:
     def _turn(self, batch: int) -> Iterator[None]:
         """Around a host call for ``batch`` environments."""
         with self._lock, np.errstate(over="ignore", invalid="ignore"):  # judged as bad physics
-            self.calls += 1
-            self._live.capacity = max(self._live.capacity, _KEPT * batch)
+            self.live.calls += 1
+            self.live.largest_batch = max(self.live.largest_batch, batch)
             yield
 
     # --- one environment --------------------------------------------------------------------------
 
     def _reset(self, seed: int) -> Outcome:
-        env = self._live.spare()
-        with self._live.dropped_on_error(env):
+        env = self.live.spare()
+        with self.live.dropped_on_error(env):
             outcome = self._reset_to(env, seed)
-        self._live.keep(outcome.token, env)
+        self.live.keep(outcome.token, env)
         return outcome
 
     def _step_one(
         self, seed: int, past: np.ndarray, token: bytes, action: np.ndarray
     ) -> Outcome | None:
         """One step from the state that ``past [length, A]`` led to; None where that is lost."""
-        env = self._live.take(token)
+        env = self.live.take(token)
         if env is None:
             env = self._brought_to(token, seed, past)
             if env is None:
                 return None
-        with self._live.dropped_on_error(env):
+        with self.live.dropped_on_error(env):
             outcome = self._act(env, token, action)
         if outcome.terminated or outcome.truncated or len(past) + 1 >= self.facts.max_steps:
-            self._live.release(env)
+            self.live.release(env)
         else:
-            self._live.keep(outcome.token, env)
+            self.live.keep(outcome.token, env)
         return outcome
 
     def _brought_to(self, token: bytes, seed: int, past: np.ndarray) -> gymnasium.Env | None:
         """An environment in that state, by doing its episode again."""
-        env = self._live.spare()
-        with self._live.dropped_on_error(env):
+        env = self.live.spare()
+        with self.live.dropped_on_error(env):
             reached = self._reset_to(env, seed).token
             for action in past:
                 reached = self._act(env, reached, action).token
         self.replayed += len(past)
         if reached == token:
             return env
-        self._live.release(env)
+        self.live.release(env)
         if not self._warned:
             self._warned = True
             warnings.warn(
@@ -275,7 +157,7 @@ class GymHost:
 
     def _reset_to(self, env: gymnasium.Env, seed: int) -> Outcome:
         obs, _ = env.reset(seed=seed)
-        return self._outcome(seed.to_bytes(_TOKEN_BYTES, "little"), b"", obs, 0.0)
+        return self._outcome(seed.to_bytes(TOKEN_BYTES, "little"), b"", obs, 0.0)
 
     def _act(self, env: gymnasium.Env, token: bytes, action: np.ndarray) -> Outcome:
         given = action.astype(self.facts.action_dtype)  # its own copy
@@ -307,5 +189,5 @@ class GymHost:
         terms = np.zeros(len(self.facts.reward_terms), np.float32)
         for i, name in enumerate(self.facts.reward_terms):
             terms[i] = (info or {}).get(name, 0.0)
-        token = hashlib.blake2b(before + seen, digest_size=_TOKEN_BYTES).digest()
+        token = hashlib.blake2b(before + seen, digest_size=TOKEN_BYTES).digest()
         return Outcome(token, values, reward, terminated, truncated, terms)

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec as RegisteredSpec
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs.gym_host import GymFacts, make
+from sacformer_jax.envs.gym_live import GymFacts, make
 from sacformer_jax.presets import Layer
 
 DEFAULT_LIMIT = 1000
