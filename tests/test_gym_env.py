@@ -14,8 +14,17 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium import spaces
+from trees import unequal
 
-from sacformer_jax import Config, ConfigError, evaluate, make_population, resume, train
+from sacformer_jax import (
+    Config,
+    ConfigError,
+    evaluate,
+    make_population,
+    make_program,
+    resume,
+    train,
+)
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cli import main
 from sacformer_jax.digests import digest
@@ -340,9 +349,28 @@ TINY = {
     "env": "gym:Pendulum-v1", "num_envs": 2, "max_episode_steps": 70, "prefill_env_steps": 200,
     "chunk_env_steps": 100, "total_env_steps": 600, "eval_every": 200, "eval_episodes": 2,
     "checkpoint_every": 200, "actor_width": 8, "actor_heads": 1, "actor_layers": 1,
-    "critic_width": 8, "batch_size": 4, "buffer_capacity": 2000, "normalize_obs": True,
-    "agent": "sac",
+    "critic_width": 8, "batch_size": 4, "buffer_capacity": 2000,
 }  # fmt: skip
+
+
+def _pendulums_forgotten():
+    """The host of the runs below, with nothing alive, as in another process."""
+    host = make_env(TINY["env"], max_episode_steps=TINY["max_episode_steps"]).host
+    host.live = LiveEnvs(gym_live.make("Pendulum-v1"), host.facts)
+    return host
+
+
+def test_a_train_state_goes_on_the_same_where_nothing_is_alive():
+    program = make_program(Config.from_preset("cpu", agent="sac", **TINY))
+    state, _ = program.prefill(program.init(jax.random.key(0)))
+    kept = jax.tree.map(jnp.copy, state)
+    straight = jax.block_until_ready(program.train_chunk(state)[0])
+    host = _pendulums_forgotten()
+    before = host.replayed
+    resumed, _ = program.train_chunk(kept)
+    assert not unequal(straight, resumed)
+    # Prefill had taken 100 steps in each of 2 environments.
+    assert host.replayed - before == 2 * (100 % 70)
 
 
 def _state_digest(path: Path) -> str:
@@ -355,20 +383,23 @@ def _state_digest(path: Path) -> str:
     return digest(restored.state, population.block_axes)
 
 
-def test_resuming_with_nothing_alive_equals_never_having_stopped(tmp_path):
-    config = Config.from_preset("cpu", **TINY, run_dir=str(tmp_path / "straight"))
-    paths = [train(config, quiet=True).path, tmp_path / "killed"]
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["sac", "sacformer"])
+def test_resuming_equals_never_having_stopped(agent, tmp_path):
+    settings = {**TINY, "agent": agent, "run_dir": str(tmp_path / "straight"), "seeds": 2}
+    paths = [train(Config.from_preset("cpu", **settings), quiet=True).path, tmp_path / "killed"]
     shutil.copytree(*paths)
     shutil.rmtree(paths[1] / "checkpoints" / "600")
-    host = make_env(TINY["env"], max_episode_steps=70).host
-    host.live = LiveEnvs(gym_live.make("Pendulum-v1"), host.facts)  # as in another process
+    host = _pendulums_forgotten()
     before = host.replayed
     resume(paths[1], quiet=True)
-    # Each of 2 environments had taken 200 steps by the checkpoint.
-    assert host.replayed - before == 2 * (200 % 70)
+    # Each of 2 environments of 2 seeds had taken 200 steps by the checkpoint.
+    assert host.replayed - before == 4 * (200 % 70)
     assert _state_digest(paths[0]) == _state_digest(paths[1])
-    assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
-    record = evaluate(paths[0], episodes=2, gymnasium=True)
+    for name in ("seed-0", "seed-1"):
+        metrics = [(path / name / "metrics.jsonl").read_bytes() for path in paths]
+        assert metrics[0] == metrics[1]
+    record = evaluate(paths[0], episodes=2, gymnasium=True, member="seed-1")
     assert (record["env"], record["length_mean"]) == ("Pendulum-v1", 200)
     assert record["return_mean"] < 0
 
