@@ -37,7 +37,7 @@ def package():
 
 @pytest.fixture(scope="module")
 def registered(package):
-    """A task of the user's own, three steps in one: a point mass that is done at a certain speed."""
+    """A task of the user's own, three steps in one: a point mass, done at a certain speed."""
     suite = package.dm_control_suite
     theirs = type(suite.load("PointMass", config_overrides={"impl": "jax"}))
 
