@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs.native import loading_quietly
+from sacformer_jax.envs.models import loading_quietly
 from sacformer_jax.policy import Policy
 
 

@@ -82,6 +82,7 @@ ALLOWED = {
     "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files
     "envs.playground_env": {"importlib", "subprocess"},  # an extra, which runs git
+    "envs.tasks": {"pathlib"},  # names one
     "envs.mjx_engine": {"threading"},  # MJX's table of collisions is the process's
 }
 DIRTY_CALLS = {"print", "open", "input", "breakpoint", "exec", "eval"}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import flax.struct
@@ -21,7 +21,7 @@ import numpy as np
 
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import where_tree
-from sacformer_jax.envs.native import load_model
+from sacformer_jax.envs.models import load_model
 from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise
 from sacformer_jax.envs.tasks import Quantities, Task
 from sacformer_jax.parallel import any_of_all
@@ -58,6 +58,8 @@ FAST_ITERATIONS = {
     "Ant": SolverIterations(8, 8),
     "Humanoid": SolverIterations(4, 8),
 }
+_FAST_ITERATIONS_ELSEWHERE = SolverIterations(8, 8)
+"""Of tasks that are not in the table: the most of those that are."""
 
 
 _WARP_CONTACTS = 2**17
@@ -80,14 +82,15 @@ def _check_warp(task: Task) -> None:
 
 @flax.struct.dataclass
 class MjxState:
-    """The physics state of one environment, its root at the origin.
+    """The physics state of one environment, its root at the origin if the task has it recentred.
 
     Attributes:
       qpos: ``[nq]``, positions relative to ``origin``.
       qvel: ``[nv]``.
       qacc_warmstart: ``[nv]``, where the constraint solver starts from.
       measured: ``[2]``, xy of what the task measures, relative to ``origin``.
-      origin: ``[2]``, how far the root has gone.
+      origin: ``[2]``, how far the root has gone, as far as it is recentred.
+      act: ``[na]``, activations of the actuators that have them; None where there are none.
     """
 
     qpos: jax.Array
@@ -95,6 +98,7 @@ class MjxState:
     qacc_warmstart: jax.Array
     measured: jax.Array
     origin: jax.Array
+    act: jax.Array | None = None
 
 
 @flax.struct.dataclass
@@ -114,14 +118,15 @@ class MjxEngine:
     """MJX behind the engine signature of :mod:`sacformer_jax.envs.physics`.
 
     Args:
-      task: the task, whose model file is loaded from the installed ``gymnasium`` package.
+      task: the task.
       preset: ``"parity"``, the model's own solver settings (PGS, which MJX lacks, becomes Newton);
         or ``"fast"``, the few iterations of :data:`FAST_ITERATIONS`.
       impl: ``"jax"``, or ``"warp"`` on NVIDIA.
       iterations: the solver's budget; overrides the preset's.
 
     Raises:
-      ConfigError: ``impl`` is ``"warp"`` and this machine or the task cannot have it.
+      ConfigError: ``impl`` is ``"warp"`` and this machine or the task cannot have it; or the task's
+        model cannot be had, or MJX cannot run it.
     """
 
     def __init__(
@@ -135,9 +140,10 @@ class MjxEngine:
             _check_warp(task)
         self.task, self._impl = task, impl
         self.model = model = load_model(task)
-        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+            model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         if iterations is None and preset == "fast":
-            iterations = FAST_ITERATIONS[task.name]
+            iterations = FAST_ITERATIONS.get(task.name, _FAST_ITERATIONS_ELSEWHERE)
         if iterations is not None:
             model.opt.iterations = iterations.newton
             model.opt.ls_iterations = iterations.line_search
@@ -145,22 +151,37 @@ class MjxEngine:
         self.dt = float(model.opt.timestep * task.frame_skip)
         low, high = model.actuator_ctrlrange.astype(np.float32).T
         self.action_low, self.action_high = jnp.asarray(low), jnp.asarray(high)
-        self._init_qpos = jnp.asarray(model.qpos0, jnp.float32)
+        self.init_qpos = jnp.asarray(model.qpos0, jnp.float32)
         self._body_mass = jnp.asarray(model.body_mass, jnp.float32)
+        free, quaternions = _joints(model)
         # A free root moves in x and y, a planar one in x.
-        self._num_root = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
-        self._mjx_model = mjx.put_model(model, impl=impl)
+        self._num_root = (2 if free else 1) if task.recentre_root else 0
+        runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        self._own_runge_kutta = runge_kutta and quaternions == free and model.na == 0
+        self._free_root = free
+        self._senses_in_stages = runge_kutta and "sensordata" in task.derived
+        self._resets_in_full = "sensordata" in task.derived or (
+            # Motors do nothing at a control of 0, other actuators may.
+            bool(model.actuator_biastype.any()) and {*task.derived} & {*_ACTUATION}
+        )
         # Warp's contacts lie in one array over all environments, whose number is not known here.
         room = {"naconmax": _WARP_CONTACTS} if impl == "warp" else {}
-        self._blank = mjx.make_data(model, impl=impl, **room)
+        try:
+            self._mjx_model = mjx.put_model(model, impl=impl)
+            self._blank = mjx.make_data(model, impl=impl, **room)
+        except NotImplementedError as error:
+            raise ConfigError(
+                f"engine='mjx': cannot run the model of task {task.name!r}: {error}; use "
+                "engine=native"
+            ) from error
 
     # --- pure functions ----------------------------------------------------------------------
 
     def reset(self, noise: ResetNoise) -> PhysicsOutput:
-        qpos = self._init_qpos + noise.qpos
+        qpos = self.init_qpos + noise.qpos
         data = self._blank.replace(qpos=qpos, qvel=noise.qvel)
         with _traced_like_mujoco():
-            if self._impl == "warp":
+            if self._impl == "warp" or self._resets_in_full:
                 data = mjx.forward(self._mjx_model, data)
             else:
                 # Contacts and solver would change nothing that a task reads after a reset.
@@ -173,6 +194,8 @@ class MjxEngine:
         data = self._blank.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
         )
+        if state.act is not None:
+            data = data.replace(act=state.act)
 
         with _traced_like_mujoco():
             data, _ = jax.lax.scan(
@@ -192,8 +215,16 @@ class MjxEngine:
 
     def _substep(self, data: mjx.Data) -> mjx.Data:
         """One physics step."""
-        if self.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-            return mjx.step(self._mjx_model, data)
+        stepped = (
+            self._runge_kutta(data) if self._own_runge_kutta else mjx.step(self._mjx_model, data)
+        )
+        if self._senses_in_stages:  # C MuJoCo senses in the first stage alone
+            sensed = mjx.forward(self._mjx_model, data)
+            stepped = stepped.replace(sensordata=sensed.sensordata)
+        return stepped
+
+    def _runge_kutta(self, data: mjx.Data) -> mjx.Data:
+        """A Runge-Kutta step, where no joint but a free root has a quaternion."""
         # MJX's own Runge-Kutta lays four copies of the dynamics into the program; one copy in a
         # loop compiles in about half the time.
         timestep = self._mjx_model.opt.timestep
@@ -221,7 +252,7 @@ class MjxEngine:
 
     def _integrate(self, qpos: jax.Array, duration: jax.Array, qvel: jax.Array) -> jax.Array:
         """``qpos`` after moving at ``qvel``; a free root turns about its own axes."""
-        if self._num_root == 1:
+        if not self._free_root:
             return qpos + duration * qvel
         return jnp.concatenate(
             [
@@ -256,7 +287,7 @@ class MjxEngine:
             qpos=data.qpos.at[: self._num_root].set(new_origin[: self._num_root]),
             qvel=data.qvel,
             displacement=jnp.zeros(2) if measured_before is None else measured - measured_before,
-            derived={name: _DERIVED[name](data) for name in self.task.derived},
+            derived={name: self._derived(name, data, origin) for name in self.task.derived},
         )
         return PhysicsOutput(
             state=MjxState(
@@ -265,6 +296,7 @@ class MjxEngine:
                 qacc_warmstart=data.qacc_warmstart,
                 measured=measured - shift,
                 origin=new_origin,
+                act=data.act if self.model.na else None,
             ),
             quantities=quantities,
             bad=~jnp.all(jnp.abs(values) <= _BAD_VALUE),  # true of NaN, too
@@ -278,13 +310,24 @@ class MjxEngine:
             return data.xpos[1, :2]
         return (self._body_mass @ data.xipos / self._body_mass.sum())[:2]
 
+    def _derived(self, name: str, data: mjx.Data, origin: jax.Array) -> jax.Array:
+        values = getattr(data._impl if name in _NOT_PUBLIC else data, name)
+        if self._num_root and name in _IN_THE_WORLD:
+            values = values.at[..., :2].add(origin)
+        return values
 
-_DERIVED: dict[str, Callable[[Any], jax.Array]] = {
-    "cinert": lambda data: data._impl.cinert,
-    "cvel": lambda data: data.cvel,
-    "qfrc_actuator": lambda data: data.qfrc_actuator,
-    "cfrc_ext": lambda data: data._impl.cfrc_ext,
-}
+
+_NOT_PUBLIC = ("cinert", "cfrc_ext")
+_IN_THE_WORLD = ("xpos", "xipos", "subtree_com", "geom_xpos", "site_xpos")
+"""Positions that move with the root."""
+_ACTUATION = ("qfrc_actuator", "actuator_force")
+
+
+def _joints(model: mujoco.MjModel) -> tuple[bool, int]:
+    """Whether the first joint is a free one, and how many joints have a quaternion."""
+    kinds = [mujoco.mjtJoint(kind) for kind in model.jnt_type]
+    with_quaternion = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    return kinds[0] == with_quaternion[0], sum(kind in with_quaternion for kind in kinds)
 
 
 # --- plane-capsule contacts as C MuJoCo makes them ------------------------------------------------

@@ -1,4 +1,4 @@
-"""A task on a physics engine: the five Gymnasium tasks as environments of the contract."""
+"""A task on a physics engine, as an environment of the contract."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
 from sacformer_jax.envs.physics import EngineChoice, PhysicsOutput, ResetNoise, make_engine
-from sacformer_jax.envs.tasks import TASKS
+from sacformer_jax.envs.tasks import TASKS, Coordinates, RewardTerms, Task
 from sacformer_jax.parallel import any_of_all
 
 
 class MujocoEnv:
-    """One of :data:`~sacformer_jax.envs.tasks.TASKS` on a physics engine.
+    """A task on a physics engine.
 
     Args:
-      name: the task's name, e.g. ``"HalfCheetah"``.
-      choice: the physics engine.
+      task: your own, or the name of one of :data:`~sacformer_jax.envs.tasks.TASKS`.
+      choice: the physics engine; default: by device.
 
     Raises:
       KeyError: no such task.
-      ConfigError: this machine or this task cannot have the engine.
+      ConfigError: this machine or this task cannot have the engine, or the task cannot be run.
     """
 
-    def __init__(self, name: str, choice: EngineChoice):
-        self.task = task = TASKS[name]
-        choice, reason = choice.resolved()
+    def __init__(self, task: Task | str, choice: EngineChoice | None = None):
+        self.task = task = TASKS[task] if isinstance(task, str) else task
+        choice, reason = (choice or EngineChoice()).resolved()
         self.engine = make_engine(task, choice)
         obs_size = jax.eval_shape(self.reset, jax.random.key(0))[1].shape[0]
         self.spec = EnvSpec(
-            name=name,
+            name=task.name,
             obs_size=obs_size,
             action_size=self.engine.action_low.shape[0],
             action_low=tuple(self.engine.action_low.tolist()),
@@ -45,7 +46,7 @@ class MujocoEnv:
         )
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
-        physics = self.engine.reset(self.reset_noise(key))
+        physics = self.engine.reset(self._start(key))
         return physics.state, self.task.observe(physics.quantities)
 
     def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
@@ -63,13 +64,31 @@ class MujocoEnv:
         num, nq, nv = len(refill), self.engine.nq, self.engine.nv
         noise = jax.lax.cond(
             any_of_all(refill),
-            lambda: jax.vmap(self.reset_noise)(keys()),
+            lambda: jax.vmap(self._start)(keys()),
             lambda: ResetNoise(qpos=jnp.zeros((num, nq)), qvel=jnp.zeros((num, nv))),
         )
         stepped, fresh = self.engine.step_and_reset(states, actions, refill, noise)
         fresh_obs = jax.vmap(self.task.observe)(fresh.quantities)
         steps = jax.vmap(self._env_step)(stepped, actions)
         return (stepped.state, steps), where_tree(refill, (fresh.state, fresh_obs), prepared)
+
+    def _start(self, key: jax.Array) -> ResetNoise:
+        """Where an episode starts, as what is added to where the model does."""
+        if self.task.reset is None:
+            return self.reset_noise(key)
+        initial = Coordinates(qpos=self.engine.init_qpos, qvel=jnp.zeros(self.engine.nv))
+        start = self.task.reset(key, initial)
+        for name in ("qpos", "qvel"):
+            expected, given = getattr(initial, name).shape, jnp.shape(getattr(start, name))
+            if given != expected:
+                raise ConfigError(
+                    f"task {self.task.name!r}: reset gives {name} of shape {given}: must be "
+                    f"{expected}"
+                )
+        return ResetNoise(
+            qpos=jnp.asarray(start.qpos, jnp.float32) - initial.qpos,
+            qvel=jnp.asarray(start.qvel, jnp.float32),
+        )
 
     def reset_noise(self, key: jax.Array) -> ResetNoise:
         """The random part of a reset, drawn as the Gymnasium task draws it."""
@@ -88,11 +107,26 @@ class MujocoEnv:
     def _env_step(self, physics: PhysicsOutput, action: jax.Array) -> EnvStep:
         quantities = physics.quantities
         x_velocity = quantities.displacement[0] / self.engine.dt
-        terms = self.task.reward_terms(quantities, action, x_velocity)
+        terms = self._as_scalars(self.task.reward_terms(quantities, action, x_velocity))
         return EnvStep(
             obs=self.task.observe(quantities),
             reward=jnp.stack(list(terms.values())).sum(),
-            terminated=self.task.terminated(quantities),
+            terminated=jnp.asarray(self.task.terminated(quantities)),
             bad=physics.bad,
             reward_terms=terms,
         )
+
+    def _as_scalars(self, terms: RewardTerms) -> RewardTerms:
+        if not isinstance(terms, dict) or not terms:
+            raise ConfigError(
+                f"task {self.task.name!r}: reward_terms gives {type(terms).__name__}: must be a "
+                'dict of one or more scalars, such as {"reward_forward": x_velocity}'
+            )
+        terms = {name: jnp.asarray(term, jnp.float32) for name, term in terms.items()}
+        for name, term in terms.items():
+            if term.shape != ():
+                raise ConfigError(
+                    f"task {self.task.name!r}: reward_terms gives {name!r} of shape {term.shape}: "
+                    "must be a scalar"
+                )
+        return terms

@@ -14,7 +14,6 @@ while JAX stays in float32. The measured position is carried because ``xpos`` an
 from __future__ import annotations
 
 import collections
-import contextlib
 import itertools
 import math
 from collections.abc import Iterator
@@ -27,28 +26,10 @@ import numpy as np
 
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs.host_call import HostCall
+from sacformer_jax.envs.models import load_model
 from sacformer_jax.envs.native_host import Job, Layout, Outputs, Threads, Worker
-from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise, model_path
+from sacformer_jax.envs.physics import PhysicsOutput, ResetNoise
 from sacformer_jax.envs.tasks import Quantities, Task
-
-
-@contextlib.contextmanager
-def loading_quietly() -> Iterator[None]:
-    """Around the loading of Gymnasium's models: drops the warnings about their old attributes.
-
-    MuJoCo's own handler would print them and write MUJOCO_LOG.TXT into the working directory.
-    """
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
-
-
-def load_model(task: Task) -> mujoco.MjModel:
-    with loading_quietly():
-        return mujoco.MjModel.from_xml_path(str(model_path(task)))
 
 
 def _as_words(values: jax.Array) -> jax.Array:
@@ -68,13 +49,17 @@ class NativeEngine:
     """C MuJoCo behind the engine signature of :mod:`sacformer_jax.envs.physics`.
 
     Args:
-      task: the task, whose model file is loaded from the installed ``gymnasium`` package.
+      task: the task.
       num_threads: host threads; default: the cores this process may use.
+
+    Raises:
+      ConfigError: the task's model cannot be had, or cannot be run.
     """
 
     def __init__(self, task: Task, num_threads: int | None = None):
         self.model = load_model(task)
         self.nq, self.nv = int(self.model.nq), int(self.model.nv)
+        self.init_qpos = jnp.asarray(self.model.qpos0, jnp.float32)
         self.dt = float(self.model.opt.timestep * task.frame_skip)
         low, high = self.model.actuator_ctrlrange.astype(np.float32).T
         self.action_low, self.action_high = jnp.asarray(low), jnp.asarray(high)

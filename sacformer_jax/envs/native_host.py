@@ -32,7 +32,6 @@ _BAD_WARNINGS = [
 # MuJoCo prints a warning, and writes MUJOCO_LOG.TXT into the working directory, only when its
 # counter is 0; counting from here keeps it quiet, and nothing is lost.
 _WARNED_BEFORE = 1000
-_DERIVED_COLUMNS = {"cinert": 10, "cvel": 6, "cfrc_ext": 6}
 # Work of a whole batch, in the unit of Job, above which it is shared between threads: below it,
 # waking them takes longer than it saves. A unit takes 0.3 to 0.5 µs; measured with two threads,
 # sharing gains nothing at 360 (8 HalfCheetahs) and 14% at 576 (4 Walker2ds).
@@ -56,9 +55,8 @@ class Layout:
     @classmethod
     def of(cls, model: mujoco.MjModel, task: Task) -> Layout:
         shapes: dict[str, tuple[int, ...]] = {"qpos": (model.nq,), "qvel": (model.nv,)}
-        for name in task.derived:
-            columns = _DERIVED_COLUMNS.get(name)
-            shapes[name] = (model.nbody, columns) if columns else (model.nv,)
+        data = mujoco.MjData(model)
+        shapes.update({name: getattr(data, name).shape for name in task.derived})
         return cls(
             {**shapes, "displacement": (2,), "bad": ()}, mujoco.mj_stateSize(model, STATE_SPEC)
         )
@@ -103,7 +101,8 @@ class Outputs:
       physics: ``[num, num_physics]`` float64, MuJoCo's state.
       measured: ``[num, 2]`` float64, the measured position.
       rows: ``[num, layout.size]`` float32.
-      copied: where a worker puts what it reads from ``MjData``, by MuJoCo's name.
+      copied: where a worker puts what it reads from ``MjData``, by MuJoCo's name, or by that of
+        what the task measures.
     """
 
     def __init__(self, numbers: np.ndarray, layout: Layout):
@@ -119,18 +118,18 @@ class Outputs:
         for name in task.derived:
             self.copied[name] = self.rows[:, layout.slices[name]].reshape(num, *layout.shapes[name])
         if task.measure == "torso":
-            self.copied["xpos"] = self.measured
+            self.copied["torso"] = self.measured
         elif task.measure == "mass_center":
-            self.copied["xipos"] = np.zeros((num, model.nbody, 2))
+            self.copied["mass_center"] = np.zeros((num, model.nbody, 2))
 
     def finish(self, model: mujoco.MjModel, measured_before: np.ndarray | None) -> None:
         """Fills in what the workers left to do for all at once."""
         num_positions = model.nq + model.nv
         self.rows[:, :num_positions] = self.physics[:, 1 : 1 + num_positions]  # after the time
-        if "xipos" in self.copied:
-            moments = model.body_mass[:, None] * self.copied["xipos"]
+        if "mass_center" in self.copied:
+            moments = model.body_mass[:, None] * self.copied["mass_center"]
             self.measured[:] = moments.sum(axis=1) / model.body_mass.sum()
-        elif "xpos" not in self.copied:
+        elif "torso" not in self.copied:
             self.measured[:, 0] = self.physics[:, 1]
         if measured_before is not None:
             self.rows[:, -3:-1] = self.measured - measured_before
@@ -154,8 +153,8 @@ class Worker:
         self.warnings = self.data.warning.number
         self.views: dict[str, np.ndarray] = {
             **{name: getattr(self.data, name) for name in task.derived},
-            "xpos": self.data.xpos[1, :2],
-            "xipos": self.data.xipos[:, :2],
+            "torso": self.data.xpos[1, :2],
+            "mass_center": self.data.xipos[:, :2],
         }
         self.no_warning = np.full_like(self.warnings, _WARNED_BEFORE).tobytes()
 

@@ -53,6 +53,8 @@ class Engine(Protocol):
 
     nq: int
     nv: int
+    init_qpos: jax.Array
+    """The model's initial position, ``[nq]`` float32; it starts at rest."""
     dt: float
     """Seconds of one environment step: time step times frame skip."""
     action_low: jax.Array
@@ -73,15 +75,31 @@ class Engine(Protocol):
         ...
 
 
+def is_mjcf(task: Task) -> bool:
+    """Whether the task holds its model itself, instead of naming a file."""
+    return isinstance(task.xml_file, str) and task.xml_file.lstrip().startswith("<")
+
+
 def model_path(task: Task) -> Path:
-    """The task's MJCF file inside the installed ``gymnasium`` package (not imported)."""
+    """The task's MJCF file: its own, or one inside the installed ``gymnasium`` (not imported).
+
+    Raises:
+      ConfigError: there is none.
+    """
+    if isinstance(task.xml_file, Path):
+        own = task.xml_file.expanduser().absolute()
+        if not own.is_file():
+            raise ConfigError(f"task {task.name!r}: there is no file {str(own)!r} (xml_file)")
+        return own
     spec = importlib.util.find_spec("gymnasium")
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError("gymnasium is not installed; the model files come from it")
     path = Path(spec.origin).parent / "envs" / "mujoco" / "assets" / task.xml_file
     if not path.is_file():
-        raise FileNotFoundError(
-            f"model of task {task.name!r}: {path} does not exist; install gymnasium >= 1.1"
+        raise ConfigError(
+            f"task {task.name!r}: xml_file={task.xml_file!r} is not among the assets of the "
+            f"installed gymnasium ({path.parent}); a file of your own is given as a Path: "
+            f"xml_file=Path({task.xml_file!r})"
         )
     return path
 

@@ -1,21 +1,27 @@
-"""The five Gymnasium-v5 MuJoCo tasks, each written once as pure functions.
+"""Tasks as pure functions of physics quantities, and the five Gymnasium-v5 ones.
 
 A task sees only :class:`Quantities`, the physics quantities an engine reports after a step, and
-knows nothing of the engine that produced them. Definitions follow ``gymnasium.envs.mujoco.*_v5``
-with their default arguments; the tests compare every number with Gymnasium itself.
+knows nothing of the engine that produced them. The five follow ``gymnasium.envs.mujoco.*_v5``
+with their default arguments; the tests compare every number with Gymnasium itself. How to write
+one of your own: docs/own_task.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-Derived = Literal["cinert", "cvel", "qfrc_actuator", "cfrc_ext"]
+Measure = Literal["root", "torso", "mass_center"]
+Derived = Literal[
+    "cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xpos", "xquat", "xipos", "subtree_com",
+    "geom_xpos", "site_xpos", "actuator_force", "sensordata",
+]  # fmt: skip
 
 
 @flax.struct.dataclass
@@ -28,8 +34,12 @@ class Quantities:
       displacement: metres moved in x and y over the step by what the task measures, ``[2]``,
         subtracted in float64 (native) so that it stays exact far from the origin; 0 at a reset.
       derived: the engine quantities the task asks for in :attr:`Task.derived`, by MuJoCo's name:
-        ``cinert [nbody, 10]``, ``cvel [nbody, 6]``, ``qfrc_actuator [nv]``,
-        ``cfrc_ext [nbody, 6]``.
+        ``xpos [nbody, 3]``, ``xquat [nbody, 4]``, ``xipos [nbody, 3]``, ``subtree_com [nbody, 3]``,
+        ``geom_xpos [ngeom, 3]``, ``site_xpos [nsite, 3]``, ``sensordata [nsensordata]``,
+        ``actuator_force [nu]``, ``qfrc_actuator [nv]``, ``cinert [nbody, 10]``,
+        ``cvel [nbody, 6]``, ``cfrc_ext [nbody, 6]``. As ``mj_step`` leaves them, so in Gymnasium
+        too, they belong to the last physics step's start: they lag ``qpos`` by one of
+        ``frame_skip`` physics steps.
     """
 
     qpos: jax.Array
@@ -38,8 +48,24 @@ class Quantities:
     derived: dict[str, jax.Array]
 
 
+@flax.struct.dataclass
+class Coordinates:
+    """Where an episode starts: generalized ``qpos [nq]`` and ``qvel [nv]``, float32."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+
+
 RewardTerms = dict[str, jax.Array]
 RewardFunction = Callable[[Quantities, jax.Array, jax.Array], RewardTerms]
+
+
+def _positions_and_velocities(q: Quantities) -> jax.Array:
+    return jnp.concatenate([q.qpos, q.qvel])
+
+
+def _never(q: Quantities) -> jax.Array:
+    return jnp.zeros((), bool)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,46 +73,54 @@ class Task:
     """One MuJoCo task: everything of it that is not physics.
 
     Attributes:
-      name: Gymnasium's name without the version, e.g. ``"HalfCheetah"``.
-      xml_file: file name of the model among the assets of the installed ``gymnasium`` package.
+      name: what it is called, e.g. ``"Reach"``.
+      xml_file: the model: the ``Path`` of an MJCF file; or MJCF itself, a string that begins with
+        ``<``; or a string, the name of a file among the assets of the installed ``gymnasium``.
+      reward_terms: ``(Quantities, action [A], x_velocity) -> terms``, scalars by name that add up
+        to the reward; ``x_velocity`` is that of what the task measures, in m/s. Gymnasium's names
+        begin with ``reward_``.
+      observe: ``Quantities -> obs [O]``; default: positions and velocities.
+      terminated: ``Quantities -> bool``; default: never.
       frame_skip: physics steps per environment step.
-      measure: what the forward reward measures: ``"root"`` (qpos[0]), ``"torso"`` (xpos of body 1)
+      measure: what ``x_velocity`` measures: ``"root"`` (qpos[0]), ``"torso"`` (xpos of body 1)
         or ``"mass_center"`` (mass-weighted xipos).
       derived: engine quantities needed beyond positions and velocities.
       qpos_noise: half-width of the uniform noise added to qpos at a reset.
       qvel_noise: half-width (uniform) or standard deviation (normal) of the qvel noise.
       qvel_noise_normal: whether the qvel noise is normal.
-      observe: ``Quantities -> obs [O]``.
-      reward_terms: ``(Quantities, action [A], x_velocity) -> terms`` that add up to the reward,
-        under the names Gymnasium's ``info`` uses.
-      terminated: ``Quantities -> bool``.
+      reset: ``(key, Coordinates of the model) -> Coordinates``, an episode's start; default: the
+        model's with the noise above.
+      recentre_root: on mjx, move the root back to the origin after every step, so that float32
+        loses nothing however far it gets. Only for one tree on the first joint, a free one or a
+        slide along x, where physics is the same everywhere: a plane for a floor, and nothing else
+        that is fixed to the world.
+      max_episode_steps: time limit, in environment steps.
+      gymnasium_id: the same task in Gymnasium, e.g. ``"HalfCheetah-v5"``, or None.
     """
 
     name: str
-    xml_file: str
-    frame_skip: int
-    measure: Literal["root", "torso", "mass_center"]
-    derived: tuple[Derived, ...]
-    qpos_noise: float
-    qvel_noise: float
-    qvel_noise_normal: bool
-    observe: Callable[[Quantities], jax.Array]
+    xml_file: str | Path
     reward_terms: RewardFunction
-    terminated: Callable[[Quantities], jax.Array]
+    observe: Callable[[Quantities], jax.Array] = _positions_and_velocities
+    terminated: Callable[[Quantities], jax.Array] = _never
+    frame_skip: int = 1
+    measure: Measure = "root"
+    derived: tuple[Derived, ...] = ()
+    qpos_noise: float = 0.0
+    qvel_noise: float = 0.0
+    qvel_noise_normal: bool = False
+    reset: Callable[[jax.Array, Coordinates], Coordinates] | None = None
+    recentre_root: bool = False
     max_episode_steps: int = 1000
+    gymnasium_id: str | None = None
 
-    @property
-    def gymnasium_id(self) -> str:
-        """The id of the same task in Gymnasium, e.g. ``"HalfCheetah-v5"``."""
-        return f"{self.name}-v5"
+    def __post_init__(self) -> None:
+        # A list would do as well, but engines are found by their task, which must have a hash.
+        object.__setattr__(self, "derived", tuple(self.derived))
 
 
 def _between(low: float, value: jax.Array, high: float) -> jax.Array:
     return (low < value) & (value < high)
-
-
-def _never(q: Quantities) -> jax.Array:
-    return jnp.zeros((), bool)
 
 
 # --- HalfCheetah -----------------------------------------------------------------------------
@@ -194,39 +228,41 @@ TASKS: dict[str, Task] = {
             xml_file="half_cheetah.xml",
             frame_skip=5,
             measure="root",
-            derived=(),
             qpos_noise=0.1,
             qvel_noise=0.1,
             qvel_noise_normal=True,
             observe=_half_cheetah_obs,
             reward_terms=_half_cheetah_reward,
-            terminated=_never,
+            recentre_root=True,
+            gymnasium_id="HalfCheetah-v5",
         ),
         Task(
             name="Hopper",
             xml_file="hopper.xml",
             frame_skip=4,
             measure="root",
-            derived=(),
             qpos_noise=5e-3,
             qvel_noise=5e-3,
             qvel_noise_normal=False,
             observe=_planar_walker_obs,
             reward_terms=_planar_walker_reward(_hopper_healthy),
             terminated=lambda q: ~_hopper_healthy(q),
+            recentre_root=True,
+            gymnasium_id="Hopper-v5",
         ),
         Task(
             name="Walker2d",
             xml_file="walker2d_v5.xml",
             frame_skip=4,
             measure="root",
-            derived=(),
             qpos_noise=5e-3,
             qvel_noise=5e-3,
             qvel_noise_normal=False,
             observe=_planar_walker_obs,
             reward_terms=_planar_walker_reward(_walker2d_healthy),
             terminated=lambda q: ~_walker2d_healthy(q),
+            recentre_root=True,
+            gymnasium_id="Walker2d-v5",
         ),
         Task(
             name="Ant",
@@ -240,6 +276,8 @@ TASKS: dict[str, Task] = {
             observe=_ant_obs,
             reward_terms=_ant_reward,
             terminated=lambda q: ~_ant_healthy(q),
+            recentre_root=True,
+            gymnasium_id="Ant-v5",
         ),
         Task(
             name="Humanoid",
@@ -253,6 +291,8 @@ TASKS: dict[str, Task] = {
             observe=_humanoid_obs,
             reward_terms=_humanoid_reward,
             terminated=lambda q: ~_humanoid_healthy(q),
+            recentre_root=True,
+            gymnasium_id="Humanoid-v5",
         ),
     )
 }
