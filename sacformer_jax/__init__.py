@@ -4,6 +4,8 @@ For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :fun
 :func:`export_policy`, :func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and
 :class:`Devices` of many members on many devices, and :class:`Callback` for your own code between
 chunks.
+For environments of your own: :class:`Task`, :class:`MujocoEnv`, :class:`JaxEnv`,
+:func:`check_env`, :func:`register_env`; for ``brax.training`` on ours: :func:`as_brax`.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
@@ -12,7 +14,21 @@ from sacformer_jax.api import collect, evaluate
 from sacformer_jax.callbacks import Callback, Event, RunStart, StopAtReturn, StopWithoutProgress
 from sacformer_jax.checkpoint import CheckpointError
 from sacformer_jax.config import Config, ConfigError
-from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.envs import (
+    Coordinates,
+    Env,
+    EnvSpec,
+    EnvStep,
+    JaxEnv,
+    MujocoEnv,
+    Quantities,
+    Task,
+    VectorEnv,
+    as_brax,
+    check_env,
+    make_env,
+    register_env,
+)
 from sacformer_jax.evaluate import make_evaluator
 from sacformer_jax.export import export_policy
 from sacformer_jax.extraction import extract
@@ -31,19 +47,29 @@ __all__ = [
     "CheckpointError",
     "Config",
     "ConfigError",
+    "Coordinates",
     "Devices",
     "DivergedError",
+    "Env",
+    "EnvSpec",
+    "EnvStep",
     "Event",
+    "JaxEnv",
     "Member",
+    "MujocoEnv",
     "Policy",
     "Population",
     "Program",
+    "Quantities",
     "RunResult",
     "RunStart",
     "StopAtReturn",
     "StopWithoutProgress",
+    "Task",
     "VectorEnv",
     "__version__",
+    "as_brax",
+    "check_env",
     "collect",
     "evaluate",
     "export_policy",
@@ -54,6 +80,7 @@ __all__ = [
     "make_population",
     "make_program",
     "policy_of",
+    "register_env",
     "report",
     "resume",
     "seed_members",

@@ -40,9 +40,10 @@ class TaskConfig:
     """What is learnt."""
 
     env: str = "HalfCheetah"
-    """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, brax:NAME, playground:NAME or gym:ID."""
+    """Task: HalfCheetah, Hopper, Walker2d, Ant, Humanoid, brax:NAME, playground:NAME, gym:ID, or
+    your own MODULE:NAME."""
     engine: EngineName = "auto"
-    """Physics engine of the MuJoCo tasks: C MuJoCo (native), MuJoCo in JAX (mjx), or by device."""
+    """Physics engine of MuJoCo tasks: C MuJoCo (native), MuJoCo in JAX (mjx), or by device."""
     mjx_preset: MjxPreset = "parity"
     """Solver of engine mjx: as in Gymnasium's models (parity), or few iterations (fast)."""
     mjx_impl: MjxImpl = "jax"
@@ -53,7 +54,7 @@ class TaskConfig:
     """Environments stepped side by side."""
     max_episode_steps: int = 1000
     """Time limit of an episode, in environment steps (truncation, not termination); by default of
-    gym:ID and playground:NAME their own."""
+    gym:ID, playground:NAME and your own tasks theirs."""
 
 
 @dataclasses.dataclass(frozen=True)

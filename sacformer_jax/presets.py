@@ -11,6 +11,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from sacformer_jax import env_names
 from sacformer_jax.config import Config, ConfigError
 
 
@@ -223,7 +224,21 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
 
 
 def _task_layers(env: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    if env_names.is_own(env):
+        return _own_layers(env, fields)
     for prefix, layers_of in TASK_LAYERS.items():
         if env.startswith(prefix):
             return layers_of(env.removeprefix(prefix), fields)
     return ()
+
+
+def _own_layers(env: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+    """What is known of an environment of the user's own."""
+    limit = env_names.own_limit(env)
+    layers = []
+    if limit is not None:
+        layers.append(Layer("the environment's own time limit", {"max_episode_steps": limit}))
+    if fields.get("return_conditioning") != "none":
+        why = "no target is known: the best return so far, or 0"
+        layers.append(Layer(why, {"target_return": "auto"}, agent="sacformer"))
+    return tuple(layers)

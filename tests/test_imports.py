@@ -16,6 +16,7 @@ PACKAGE = "sacformer_jax"
 # the settings. A new module needs a place here.
 ARROW: tuple[tuple[str, ...], ...] = (
     ("version", "cores", "values", "parallel"),
+    ("env_names",),
     ("config", "validation", "presets"),
     ("members",),
     ("envs",),
@@ -79,6 +80,7 @@ ALLOWED = {
     "envs.gym_host": {"gymnasium", "threading", "warnings"},  # the environments are Gymnasium's
     "envs.gym_live": {"gymnasium"},
     "envs.gym_registry": {"gymnasium", "importlib"},
+    "env_names": {"importlib", "os", "sys"},  # finds the user's module
     "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files
     "envs.playground_env": {"importlib", "subprocess"},  # an extra, which runs git

@@ -197,7 +197,7 @@ def contenders(task: str, num_envs: int, stack: contextlib.ExitStack) -> dict[st
     }
     if num_envs in GYM_SIZES:
         for mode in ("async", "sync"):
-            gym = gymnasium_envs(TASKS[task].gymnasium_id, mode, num_envs)
+            gym = gymnasium_envs(f"{task}-v5", mode, num_envs)
             found[f"gym_{mode}.{task}"] = stack.enter_context(gym)
     if not on_cpu or num_envs in COSTLY_SIZES:
         if not on_cpu or task in MJX_TASKS:

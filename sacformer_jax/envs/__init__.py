@@ -2,47 +2,71 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from sacformer_jax import env_names
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs.core import Env, EnvSpec, EnvStep, VectorEnv, VectorEnvState, VectorStep
+from sacformer_jax.envs.checking import check_env
+from sacformer_jax.envs.core import (
+    Env,
+    EnvSpec,
+    EnvStep,
+    JaxEnv,
+    VectorEnv,
+    VectorEnvState,
+    VectorStep,
+)
+from sacformer_jax.envs.mujoco_env import MujocoEnv
+from sacformer_jax.envs.own import as_env, own_env, register_env
 from sacformer_jax.envs.physics import ENGINES, EngineChoice
-from sacformer_jax.envs.tasks import TASKS
+from sacformer_jax.envs.tasks import TASKS, Coordinates, Quantities, Task
 from sacformer_jax.presets import TASK_LAYERS, Layer
+
+if TYPE_CHECKING:
+    from sacformer_jax.envs.brax_view import BraxView
 
 BRAX_PREFIX, GYM_PREFIX, PLAYGROUND_PREFIX = "brax:", "gym:", "playground:"
 
 __all__ = [
     "ENGINES",
     "TASKS",
+    "Coordinates",
     "EngineChoice",
     "Env",
     "EnvSpec",
     "EnvStep",
+    "JaxEnv",
+    "MujocoEnv",
+    "Quantities",
+    "Task",
     "VectorEnv",
     "VectorEnvState",
     "VectorStep",
+    "as_brax",
+    "check_env",
     "make_env",
+    "register_env",
 ]
 
 
 def make_env(
-    name: str,
+    name: str | Any,
     engine: str = "auto",
     brax_backend: str = "spring",
     mjx_preset: str = "parity",
     mjx_impl: str = "jax",
     max_episode_steps: int | None = None,
 ) -> Env:
-    """Makes an environment by name.
+    """Makes an environment by name, or of an object.
 
     Args:
       name: a MuJoCo task (``"HalfCheetah"``, …), ``"brax:NAME"`` for any environment of
         ``brax.envs`` (``"brax:ant"``), ``"playground:NAME"`` for a task of MuJoCo Playground
         (``"playground:CheetahRun"``) or ``"gym:ID"`` for one of Gymnasium's registry
-        (``"gym:Pendulum-v1"``).
-      engine: physics engine of the MuJoCo tasks: ``"native"`` (C MuJoCo on the host), ``"mjx"``
-        (MuJoCo in JAX, on the device) or ``"auto"`` (native on CPU, mjx on accelerators).
+        (``"gym:Pendulum-v1"``); for one of your own ``"module:attribute"``, a name given to
+        :func:`register_env`, or the object itself (see there).
+      engine: physics engine of MuJoCo tasks, yours too: ``"native"`` (C MuJoCo on the host),
+        ``"mjx"`` (MuJoCo in JAX, on the device) or ``"auto"`` (native on CPU, mjx on accelerators).
       brax_backend: ``"spring"``, ``"positional"``, ``"generalized"`` or ``"mjx"``.
       mjx_preset: solver of engine mjx: ``"parity"`` (as in the models) or ``"fast"``.
       mjx_impl: ``"jax"``, or ``"warp"`` on NVIDIA.
@@ -50,8 +74,14 @@ def make_env(
         limit.
 
     Raises:
-      ConfigError: an unknown name (the message lists what exists), engine or backend.
+      ConfigError: an unknown name (the message lists what exists), engine or backend; or one of
+        your own that breaks the contract of :func:`check_env`.
     """
+    choice = EngineChoice(engine, mjx_preset, mjx_impl)
+    if not isinstance(name, str):
+        return as_env(name, choice)
+    if env_names.is_own(name):
+        return own_env(name, choice)
     if name.startswith(BRAX_PREFIX):
         from sacformer_jax.envs.brax_env import BraxEnv
 
@@ -68,13 +98,20 @@ def make_env(
         from sacformer_jax.envs.brax_env import brax_names
 
         known = [*TASKS, *(BRAX_PREFIX + brax_name for brax_name in brax_names())]
+        known += env_names.registered()
         raise ConfigError(
             f"env={name!r}: no such environment; there are {', '.join(known)}, "
-            f"{PLAYGROUND_PREFIX}NAME and {GYM_PREFIX}ID"
+            f"{PLAYGROUND_PREFIX}NAME and {GYM_PREFIX}ID; and for one of your own "
+            "MODULE:ATTRIBUTE (register_env makes a name known in its own process alone)"
         )
-    from sacformer_jax.envs.mujoco_env import MujocoEnv
+    return MujocoEnv(name, choice)
 
-    return MujocoEnv(name, EngineChoice(engine, mjx_preset, mjx_impl))
+
+def as_brax(env: Env) -> BraxView:
+    """An environment of ours as a ``brax.envs.Env``, for ``brax.training`` and its peers."""
+    from sacformer_jax.envs.brax_view import as_brax
+
+    return as_brax(env)
 
 
 def _gym_layers(env_id: str, fields: dict[str, Any]) -> tuple[Layer, ...]:

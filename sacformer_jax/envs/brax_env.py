@@ -26,32 +26,49 @@ class BraxEnv(JaxEnv):
     """A brax environment. Brax's ``done`` is a termination; the time limit is ours.
 
     Args:
-      name: brax's name, e.g. ``"halfcheetah"``.
-      backend: physics backend.
+      env: brax's name, e.g. ``"halfcheetah"``; or an environment itself, bare of wrappers. Its
+        attribute ``max_episode_steps``, where it has one, is the time limit; otherwise 1000.
+      backend: physics backend of an environment given by name.
+      name: what an environment that is given itself is called; default: its class.
 
     Raises:
-      ConfigError: no such environment or backend.
+      ConfigError: no such environment or backend, or one that resets itself, or whose observation
+        is no vector.
     """
 
-    def __init__(self, name: str, backend: str = "spring"):
+    def __init__(self, env: str | brax_envs.Env, backend: str = "spring", name: str | None = None):
+        if isinstance(env, str):
+            self._env, name = self._by_name(env, backend), f"brax:{env}"
+            engine_reason = "as asked for"
+        else:
+            self._env, name = env, name or type(env).__name__
+            engine_reason = "the environment's own"
+            _check_bare(env, name)
+        obs = jax.eval_shape(self._env.reset, jax.random.key(0)).obs
+        if len(getattr(obs, "shape", ())) != 1:
+            kind = f"an array of shape {obs.shape}" if hasattr(obs, "shape") else type(obs).__name__
+            raise ConfigError(f"env={name!r}: its observation is {kind}: must be one vector [O]")
+        # Brax's policies act in the unit box; where the actuators' range is another, brax scales.
+        unit = (1.0,) * int(self._env.action_size)
+        self.spec = EnvSpec(
+            name=name,
+            obs_size=obs.shape[0],
+            action_size=len(unit),
+            action_low=tuple(-bound for bound in unit),
+            action_high=unit,
+            max_episode_steps=getattr(self._env, "max_episode_steps", 1000),
+            engine=f"brax {self._env.backend}",
+            engine_reason=engine_reason,
+        )
+
+    @staticmethod
+    def _by_name(name: str, backend: str) -> brax_envs.Env:
         if name not in brax_names():
             known = ", ".join(f"brax:{known}" for known in brax_names())
             raise ConfigError(f"env='brax:{name}': no such environment; there are {known}")
         if backend not in BACKENDS:
             raise ConfigError(f"brax_backend={backend!r}: must be one of {', '.join(BACKENDS)}")
-        self._env = brax_envs.get_environment(name, backend=backend)
-        # Brax's policies act in the unit box; where the actuators' range is another, brax scales.
-        unit = (1.0,) * self._env.action_size
-        self.spec = EnvSpec(
-            name=f"brax:{name}",
-            obs_size=jax.eval_shape(self._env.reset, jax.random.key(0)).obs.shape[-1],
-            action_size=int(self._env.action_size),
-            action_low=tuple(-bound for bound in unit),
-            action_high=unit,
-            max_episode_steps=1000,
-            engine=f"brax {backend}",
-            engine_reason="as asked for",
-        )
+        return brax_envs.get_environment(name, backend=backend)
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         state = self._env.reset(key)
@@ -67,3 +84,14 @@ class BraxEnv(JaxEnv):
             reward_terms={k: v for k, v in state.metrics.items() if k.startswith("reward_")},
         )
         return state, step
+
+
+def _check_bare(env: brax_envs.Env, name: str) -> None:
+    inner: Any = env
+    while isinstance(inner, brax_envs.Wrapper):
+        if type(inner).__module__.startswith("brax.envs.wrappers"):
+            raise ConfigError(
+                f"env={name!r}: is wrapped in brax's {type(inner).__name__}: give the bare "
+                "environment; many at once, the time limit and resets are added here"
+            )
+        inner = inner.env

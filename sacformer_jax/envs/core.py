@@ -27,7 +27,7 @@ class EnvSpec:
     """Static facts of an environment.
 
     Attributes:
-      name: the name it was made by, e.g. ``"HalfCheetah"`` or ``"brax:ant"``.
+      name: what it is called, e.g. ``"HalfCheetah"`` or ``"brax:ant"``.
       obs_size: O, length of an observation (float32).
       action_size: A, length of an action (float32).
       action_low: lower action bounds, ``A`` floats.

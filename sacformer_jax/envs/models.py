@@ -89,7 +89,7 @@ def _check_model(task: Task, model: mujoco.MjModel) -> None:
     low, high = model.actuator_ctrlrange.T
     limited = model.actuator_ctrllimited.astype(bool)
     # Actions are drawn from the bounds and scaled to them.
-    unbounded = [_actuator(model, i) for i in np.flatnonzero(~(limited & (low < high)))]
+    unbounded = [_actuator(model, int(i)) for i in np.flatnonzero(~(limited & (low < high)))]
     require(
         not unbounded,
         f"has actuators without a range of control: {', '.join(unbounded)}; give each a ctrlrange "
