@@ -6,7 +6,6 @@ Here a name is only looked up. What kinds of objects are environments is
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import functools
 import importlib
@@ -86,20 +85,25 @@ def called(name: str, factory: Callable[[], Any]) -> Any:
     Raises:
       ConfigError: it cannot be called without arguments.
     """
-    with contextlib.suppress(ValueError):  # what is built in may not tell
+    try:
         signature = inspect.signature(factory)
-        try:
-            signature.bind()
-        except TypeError as error:
-            raise ConfigError(
-                f"env={name!r}: cannot be called without arguments ({error}); name a function that "
-                "needs none"
-            ) from error
+    except ValueError:  # what is built in may not tell
+        return factory()
+    try:
+        signature.bind()
+    except TypeError as error:
+        raise ConfigError(
+            f"env={name!r}: cannot be called without arguments ({error}); name a function that "
+            "needs none"
+        ) from error
     return factory()
 
 
 def _imported(name: str) -> Any:
     module_name, _, attribute = name.partition(":")
+    if module_name.endswith(".py"):
+        right = f"{module_name.removesuffix('.py').replace('/', '.')}:{attribute}"
+        raise ConfigError(f"env={name!r}: name the module, not its file: {right}")
     parts = [*module_name.split("."), *attribute.split(".")]
     if not all(part.isidentifier() for part in parts):
         raise ConfigError(
@@ -134,10 +138,18 @@ def _module(name: str, module_name: str) -> ModuleType:
 
 
 def _missing(module: ModuleType, holder: Any, part: str) -> str:
-    public = [known for known in vars(holder) if not known.startswith("_")]
+    public = [
+        known
+        for known, value in vars(holder).items()
+        if not known.startswith("_")
+        and not isinstance(value, ModuleType)
+        # What the module has imported from elsewhere is not meant.
+        and not (callable(value) and getattr(value, "__module__", None) != module.__name__)
+    ]
     close = difflib.get_close_matches(part, public, n=3)
-    hint = f"did you mean {' or '.join(map(repr, close))}?" if close else (
-        f"it has {', '.join(public[:20]) or 'nothing public'}"
-    )  # fmt: skip
-    what = "module" if holder is module else "object"
-    return f"the {what} {module.__name__!r} ({module.__file__}) has no {part!r}; {hint}"
+    if close:
+        hint = f"did you mean {' or '.join(map(repr, close))}?"
+    else:
+        hint = f"it has {', '.join(public[:20]) or 'nothing public'}"
+    where = f"module {module.__name__!r} ({module.__file__})"
+    return f"{where if holder is module else f'what it names in {where}'} has no {part!r}; {hint}"

@@ -47,7 +47,8 @@ def load_model(task: Task) -> mujoco.MjModel:
         if isinstance(error, ConfigError):
             raise
         what = "its MJCF" if is_mjcf(task) else f"xml_file={str(task.xml_file)!r}"
-        raise ConfigError(f"task {task.name!r}: {what} does not compile: {error}") from error
+        problem = " ".join(str(error).split())
+        raise ConfigError(f"task {task.name!r}: {what} does not compile: {problem}") from error
     _check_model(task, model)
     return model
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import numpy as np
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
 from sacformer_jax.envs.physics import EngineChoice, PhysicsOutput, ResetNoise, make_engine
-from sacformer_jax.envs.tasks import TASKS, Coordinates, RewardTerms, Task
+from sacformer_jax.envs.tasks import TASKS, Coordinates, Derived, RewardTerms, Task
 from sacformer_jax.parallel import any_of_all
 
 
@@ -32,10 +32,14 @@ class MujocoEnv:
         self.task = task = TASKS[task] if isinstance(task, str) else task
         choice, reason = (choice or EngineChoice()).resolved()
         self.engine = make_engine(task, choice)
-        obs_size = jax.eval_shape(self.reset, jax.random.key(0))[1].shape[0]
+        obs = jax.eval_shape(self.reset, jax.random.key(0))[1]
+        if len(getattr(obs, "shape", ())) != 1 or obs.dtype != jnp.float32:
+            raise ConfigError(
+                f"task {task.name!r}: observe gives {obs}: must be a vector [O] of float32"
+            )
         self.spec = EnvSpec(
             name=task.name,
-            obs_size=obs_size,
+            obs_size=obs.shape[0],
             action_size=self.engine.action_low.shape[0],
             action_low=tuple(self.engine.action_low.tolist()),
             action_high=tuple(self.engine.action_high.tolist()),
@@ -47,7 +51,7 @@ class MujocoEnv:
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         physics = self.engine.reset(self._start(key))
-        return physics.state, self.task.observe(physics.quantities)
+        return physics.state, self._read(self.task.observe, physics.quantities)
 
     def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
         physics = self.engine.step(state, action)
@@ -107,20 +111,32 @@ class MujocoEnv:
     def _env_step(self, physics: PhysicsOutput, action: jax.Array) -> EnvStep:
         quantities = physics.quantities
         x_velocity = quantities.displacement[0] / self.engine.dt
-        terms = self._as_scalars(self.task.reward_terms(quantities, action, x_velocity))
+        terms = self._as_scalars(self._read(self.task.reward_terms, quantities, action, x_velocity))
         return EnvStep(
-            obs=self.task.observe(quantities),
+            obs=self._read(self.task.observe, quantities),
             reward=jnp.stack(list(terms.values())).sum(),
-            terminated=jnp.asarray(self.task.terminated(quantities)),
+            terminated=jnp.asarray(self._read(self.task.terminated, quantities)),
             bad=physics.bad,
             reward_terms=terms,
         )
 
+    def _read(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Calls a function of the task's."""
+        try:
+            return function(*arguments)
+        except KeyError as error:
+            if error.args[0] not in get_args(Derived):
+                raise
+            raise ConfigError(
+                f"task {self.task.name!r}: derived={self.task.derived}: has no {error}, which "
+                "its functions read; name it there"
+            ) from error
+
     def _as_scalars(self, terms: RewardTerms) -> RewardTerms:
         if not isinstance(terms, dict) or not terms:
             raise ConfigError(
-                f"task {self.task.name!r}: reward_terms gives {type(terms).__name__}: must be a "
-                'dict of one or more scalars, such as {"reward_forward": x_velocity}'
+                f"task {self.task.name!r}: reward_terms must give a dict of one or more scalars, "
+                'such as {"reward_forward": x_velocity}'
             )
         terms = {name: jnp.asarray(term, jnp.float32) for name, term in terms.items()}
         for name, term in terms.items():
