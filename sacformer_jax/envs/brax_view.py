@@ -40,7 +40,7 @@ class BraxView(brax_envs.Env):
         env_state, obs = self.env.reset(rng)
         zero = jnp.zeros(())
         terms = jax.eval_shape(
-            self.env.step, env_state, self._to_bounds(jnp.zeros(self.action_size))
+            self.env.step, env_state, self.to_bounds(jnp.zeros(self.action_size))
         )
         metrics = dict.fromkeys((*terms[1].reward_terms, "bad_physics"), zero)
         return brax_envs.State(
@@ -49,7 +49,7 @@ class BraxView(brax_envs.Env):
 
     def step(self, state: brax_envs.State, action: jax.Array) -> brax_envs.State:
         """One step under ``action [A]`` in the unit box."""
-        env_state, step = self.env.step(state.pipeline_state, self._to_bounds(action))
+        env_state, step = self.env.step(state.pipeline_state, self.to_bounds(action))
         bad = step.bad
         terms = {name: jnp.where(bad, 0.0, value) for name, value in step.reward_terms.items()}
         return state.replace(
@@ -73,7 +73,8 @@ class BraxView(brax_envs.Env):
         """The physics engine."""
         return self.env.spec.engine
 
-    def _to_bounds(self, action: jax.Array) -> jax.Array:
+    def to_bounds(self, action: jax.Array) -> jax.Array:
+        """An action of the unit box, as brax's policies give them, in the task's bounds."""
         low, high = jnp.array(self.env.spec.action_low), jnp.array(self.env.spec.action_high)
         return (low + high) / 2 + (high - low) / 2 * action
 
