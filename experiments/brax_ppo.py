@@ -32,15 +32,9 @@ from sacformer_jax.envs.brax_view import BraxView
 from sacformer_jax.envs.models import loading_quietly
 
 RESULTS = Path(__file__).parent / "results" / "brax_ppo.json"
-REPORTED = (
-    "eval/episode_reward",
-    "eval/episode_reward_std",
-    "eval/avg_episode_length",
-    "eval/episode_bad_physics",
-    "training/total_loss",
-    "training/sps",
-)
-UNROLL_STEPS, BATCH, MINIBATCHES = 16, 16, 16
+REPORTED = ("eval/episode_", "eval/avg_episode_length", "training/total_loss", "training/sps")
+"""How the names of the metrics begin that are kept."""
+BATCH, MINIBATCHES = 16, 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +45,7 @@ class Setting:
       env: one of our tasks.
       steps: environment steps, rounded up by brax to whole rounds.
       num_envs: environments side by side; must divide 256, the pieces of a round.
+      unroll_steps: of a piece.
       evaluations: brax's own, the one before the first step included.
       seed: of everything random.
       width: of the two hidden layers of policy and value.
@@ -61,6 +56,7 @@ class Setting:
     env: str = "HalfCheetah"
     steps: int = 500_000
     num_envs: int = 16
+    unroll_steps: int = 16
     evaluations: int = 11
     seed: int = 0
     width: int = 64
@@ -127,7 +123,7 @@ def train(setting: Setting) -> Trained:
         entropy_cost=1e-3,
         discounting=0.99,
         normalize_observations=True,
-        unroll_length=UNROLL_STEPS,
+        unroll_length=setting.unroll_steps,
         batch_size=BATCH,
         num_minibatches=MINIBATCHES,
         num_updates_per_batch=8,
@@ -182,7 +178,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "machine": machine_facts,
         "training_seconds": seconds,
         "evaluations": {
-            str(steps): {name: metrics[name] for name in REPORTED if name in metrics}
+            str(steps): {
+                name: value for name, value in metrics.items() if name.startswith(REPORTED)
+            }
             for steps, metrics in trained.evaluations.items()
         },
         "gymnasium_returns": returns,

@@ -30,6 +30,7 @@ from sacformer_jax.envs.brax_env import BraxEnv
 from sacformer_jax.envs.own import as_env
 from sacformer_jax.envs.physics import EngineChoice
 from sacformer_jax.presets import resolve
+from sacformer_jax.train import make_training_env
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -227,6 +228,12 @@ def test_what_lacks_the_methods_is_told_to_derive_from_jax_env():
 # --- whole runs ----------------------------------------------------------------------------------
 
 
+def test_a_training_environment_is_made_of_it(names):
+    env = make_training_env(Config.from_preset("cpu", **TINY))
+    assert (env.num_envs, env.max_episode_steps, env.spec.name) == (2, EPISODE, "point")
+
+
+@pytest.mark.slow
 def test_a_run_goes_on_in_another_process_and_its_policy_needs_no_environment(names, tmp_path):
     run = tmp_path / "run"
     result = train(Config.from_preset("cpu", run_dir=str(run), **TINY), quiet=True)
