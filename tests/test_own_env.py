@@ -331,3 +331,17 @@ def test_the_page_shows_the_examples_as_they_are(name):
     assert text in (ROOT / "docs" / "own_task.md").read_text()
     if name.endswith(".py"):
         assert len([line for line in text.splitlines() if line.strip()]) <= 40
+
+
+def test_the_pages_environment_keeps_the_contract():
+    page = (ROOT / "docs" / "own_task.md").read_text()
+    (code,) = [block for block in page.split("```python\n") if "class Point(JaxEnv)" in block]
+    namespace: dict[str, type] = {}
+    exec(code.split("```")[0], namespace)
+    point, key, action = namespace["Point"](), jax.random.key(0), jnp.array([0.5])
+    check_env(point, num_steps=0)
+    state, expected_state = point.reset(key)[0], PointEnv().reset(key)[0]
+    np.testing.assert_array_equal(state, expected_state)
+    step, expected = point.step(state, action)[1], PointEnv().step(expected_state, action)[1]
+    np.testing.assert_allclose(step.obs, expected.obs, rtol=1e-6)
+    assert step.reward == expected.reward
