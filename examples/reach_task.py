@@ -28,7 +28,7 @@ def reward_terms(q: Quantities, action: jax.Array, x_velocity: jax.Array) -> dic
 def reset(key: jax.Array, initial: Coordinates) -> Coordinates:
     angles = jax.random.uniform(key, (3,), minval=-2.5, maxval=2.5)  # shoulder, elbow, target
     target = 0.15 * jnp.stack([jnp.cos(angles[2]), jnp.sin(angles[2])])
-    return initial.replace(qpos=jnp.concatenate([angles[:2], target]))
+    return Coordinates(qpos=jnp.concatenate([angles[:2], target]), qvel=initial.qvel)
 
 
 reach = Task(

@@ -30,21 +30,21 @@ class SwingUp(PipelineEnv):
     def reset(self, rng: jax.Array) -> State:
         hanging = jax.random.uniform(rng, (1,), minval=-0.1, maxval=0.1)
         physics = self.pipeline_init(hanging, jnp.zeros(1))
-        zero = jnp.zeros(())
-        return State(physics, self._observe(physics), zero, zero, {"reward_height": zero})
+        obs, zero = self._observe(physics.q, physics.qd), jnp.zeros(())
+        return State(physics, obs, reward=zero, done=zero, metrics={"reward_height": zero})
 
     def step(self, state: State, action: jax.Array) -> State:
         physics = self.pipeline_step(state.pipeline_state, action)
         height = -jnp.cos(physics.q[0])  # 1 upright, -1 hanging
         return state.replace(
             pipeline_state=physics,
-            obs=self._observe(physics),
+            obs=self._observe(physics.q, physics.qd),
             reward=height - 0.01 * jnp.sum(action**2),
             metrics={"reward_height": height},
         )
 
-    def _observe(self, physics) -> jax.Array:
-        return jnp.concatenate([jnp.cos(physics.q), jnp.sin(physics.q), physics.qd])
+    def _observe(self, q: jax.Array, qd: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.cos(q), jnp.sin(q), qd])
 
 
 if __name__ == "__main__":

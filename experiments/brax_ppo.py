@@ -149,9 +149,8 @@ def in_gymnasium(setting: Setting, trained: Trained) -> list[float]:
             obs, _ = env.reset(seed=setting.seed + episode)
             total, done = 0.0, False
             while not done:
-                action = trained.policy(jnp.asarray(obs, jnp.float32))
-                action = np.asarray(view.to_bounds(action))
-                obs, reward, terminated, truncated, _ = env.step(action)
+                action = view.to_bounds(trained.policy(jnp.asarray(obs, jnp.float32)))
+                obs, reward, terminated, truncated, _ = env.step(np.asarray(action))
                 total, done = total + float(reward), terminated or truncated
             returns.append(total)
     return returns
