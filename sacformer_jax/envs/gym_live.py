@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import gymnasium
 import numpy as np
 
-from sacformer_jax.envs.native import loading_quietly
+from sacformer_jax.envs.models import loading_quietly
 
 TOKEN_WORDS = 4
 TOKEN_BYTES = 4 * TOKEN_WORDS
