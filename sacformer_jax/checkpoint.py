@@ -125,7 +125,7 @@ class CheckpointWriter:
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(state),
+                    state=ocp.args.StandardSave(stored.without_empty(state)),
                     policy=ocp.args.StandardSave(policy),
                     metadata=ocp.args.JsonSave(metadata),
                 ),

@@ -14,6 +14,7 @@ import hashlib
 import inspect
 import json
 import logging
+import math
 import os
 import re
 import shutil
@@ -27,6 +28,7 @@ from types import TracebackType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import tensorstore
 
@@ -266,6 +268,28 @@ def read_metadata(step_path: Path) -> dict[str, Any]:
 # --- arrays --------------------------------------------------------------------------------------
 
 
+def without_empty(tree: Any) -> Any:
+    """The tree with None for arrays of no elements, which Orbax refuses to save.
+
+    A physics state may well have some: contacts of a model without any.
+    """
+    return jax.tree.map(lambda leaf: leaf if math.prod(leaf.shape) else None, tree)
+
+
+def _with_empty(tree: Any, abstract: Any, shardings: Any) -> Any:
+    """Inverse of :func:`without_empty`, for a tree like ``abstract``."""
+    found = iter(jax.tree.leaves(tree))
+    leaves = [
+        next(found)
+        if math.prod(leaf.shape)
+        else jax.device_put(jnp.zeros(leaf.shape, leaf.dtype), sharding)
+        for leaf, sharding in zip(
+            jax.tree.leaves(abstract), jax.tree.leaves(shardings), strict=True
+        )
+    ]
+    return jax.tree.unflatten(jax.tree.structure(abstract), leaves)
+
+
 def read_item(
     step_path: Path, item: str, metadata: dict[str, Any], abstract: Any, shardings: Any = None
 ) -> Any:
@@ -295,7 +319,9 @@ def read_item(
     handler = ocp.StandardCheckpointHandler(multiprocessing_options=processes.alone())
     try:
         with Silence():
-            return handler.restore(step_path / item, args=ocp.args.StandardRestore(target))
+            args = ocp.args.StandardRestore(without_empty(target))
+            restored = handler.restore(step_path / item, args=args)
+            return _with_empty(restored, abstract, shardings)
     except Exception as error:  # Orbax raises many kinds for damaged files
         reason, cause = one_line(error), _root(error)
         others = (MemoryError, PermissionError, jax.errors.JaxRuntimeError)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -41,6 +43,18 @@ class PointEnv(JaxEnv):
         no = jnp.zeros((), bool)
         step = EnvStep(obs=state, reward=reward, terminated=no, bad=no, reward_terms={"r": reward})
         return state, step
+
+
+class KeepingEnv(PointEnv):
+    """The same with more in its state, as physics engines have: an array of nothing, and a key."""
+
+    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+        state, obs = super().reset(key)
+        return {"point": state, "contacts": jnp.zeros((0, 3)), "key": key}, obs
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, EnvStep]:
+        point, step = super().step(state["point"], action)
+        return {**state, "point": point, "key": jax.random.split(state["key"])[0]}, step
 
 
 def point_env(num_envs: int) -> VectorEnv:

@@ -11,9 +11,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 from brax import envs as brax_envs
 from probe import EPISODE, PointEnv
+from trees import unequal
 
 from sacformer_jax import (
     Config,
@@ -24,6 +26,7 @@ from sacformer_jax import (
     load_policy,
     make_env,
     register_env,
+    stored,
     train,
 )
 from sacformer_jax.envs.brax_env import BraxEnv
@@ -38,7 +41,7 @@ sys.path.append(str(EXAMPLES))
 from swing_up_env import SwingUp  # noqa: E402
 
 TINY = {
-    "env": "probe:PointEnv", "agent": "sac", "num_envs": 2, "prefill_env_steps": 40,
+    "env": "probe:KeepingEnv", "agent": "sac", "num_envs": 2, "prefill_env_steps": 40,
     "total_env_steps": 100, "chunk_env_steps": 20, "buffer_capacity": 200, "batch_size": 4,
     "actor_width": 8, "actor_layers": 1, "critic_width": 8, "eval_every": 20,
     "checkpoint_every": 20, "eval_episodes": 2,
@@ -226,6 +229,16 @@ def test_what_lacks_the_methods_is_told_to_derive_from_jax_env():
 
 
 # --- whole runs ----------------------------------------------------------------------------------
+
+
+def test_arrays_without_elements_are_stored_too(tmp_path):
+    tree = {"full": jnp.arange(3.0), "none": jnp.zeros((0, 3)), "inner": [jnp.zeros(0, jnp.int32)]}
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(tmp_path / "state", stored.without_empty(tree))
+    metadata = {"items": {"state": stored.described(tree)}, "version": "1"}
+    restored = stored.read_item(tmp_path, "state", metadata, jax.eval_shape(lambda: tree))
+    assert not unequal(restored, tree)
+    stored.check_digests("state", metadata, restored)
 
 
 def test_a_training_environment_is_made_of_it(names):
