@@ -110,7 +110,7 @@ def test_a_factory_is_called_once_whatever_asks(here):
         ("users_module:", "must be MODULE:ATTRIBUTE"),
         ("users_module.py:point", "name the module, not its file: users_module:point"),
         ("Chetah", r"no such environment; there are HalfCheetah, .*MODULE:ATTRIBUTE"),
-        ("playground:point", "no such environment"),
+        ("brax:point", "no such environment"),
     ],
 )
 def test_names_that_stand_for_nothing_are_told_what_was_tried(here, name, message):
@@ -121,7 +121,7 @@ def test_names_that_stand_for_nothing_are_told_what_was_tried(here, name, messag
 def test_what_was_registered_is_known_and_nothing_else_is_hidden_by_it(names):
     register_env("point", PointEnv)
     assert isinstance(make_env("point"), PointEnv)
-    with pytest.raises(ConfigError, match=r"there are HalfCheetah, .*, point; and for one"):
+    with pytest.raises(ConfigError, match=r"there are HalfCheetah, .*, point, playground:NAME .*; and for one"):
         make_env("pont")
     with pytest.raises(ConfigError, match=r"'point': is registered already; .*replace=True"):
         register_env("point", PointEnv)
