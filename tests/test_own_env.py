@@ -121,7 +121,9 @@ def test_names_that_stand_for_nothing_are_told_what_was_tried(here, name, messag
 def test_what_was_registered_is_known_and_nothing_else_is_hidden_by_it(names):
     register_env("point", PointEnv)
     assert isinstance(make_env("point"), PointEnv)
-    with pytest.raises(ConfigError, match=r"there are HalfCheetah, .*, point, playground:NAME .*; and for one"):
+    with pytest.raises(
+        ConfigError, match=r"there are HalfCheetah, .*, point, playground:NAME .*; and for one"
+    ):
         make_env("pont")
     with pytest.raises(ConfigError, match=r"'point': is registered already; .*replace=True"):
         register_env("point", PointEnv)
@@ -182,6 +184,9 @@ BROKEN = {
     r"step: reward is float32\[1\]: must be float32\[\]": changed(with_step(reward=lambda s, a: a)),
     r"step: terminated is float32\[\]: must be bool\[\]": changed(
         with_step(terminated=lambda s, a: s.reward)
+    ),
+    r"step: truncated is bool\[1\]: must be bool\[\]": changed(
+        with_step(truncated=lambda s, a: a > 0)
     ),
     "reward_terms is of type list": changed(with_step(reward_terms=lambda s, a: [s.reward])),
     "must be an EnvStep": changed(lambda state, step, action: (state, step.obs)),

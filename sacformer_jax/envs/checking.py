@@ -120,6 +120,7 @@ class _Check:
         self._array("step: reward", step.reward, (), jnp.float32)
         self._array("step: terminated", step.terminated, (), jnp.bool_)
         self._array("step: bad", step.bad, (), jnp.bool_)
+        self._array("step: truncated", step.truncated, (), jnp.bool_)
         self.require(
             isinstance(step.reward_terms, dict),
             f"step: reward_terms is of type {type(step.reward_terms).__name__}: must be a dict",
