@@ -68,6 +68,10 @@ def find(name: str) -> Any:
 def own_limit(name: str) -> int | None:
     """The time limit of an own environment, in its steps, where it says one."""
     env = find(name)
+    if hasattr(env, "mjx_model") and hasattr(env, "_config"):
+        from sacformer_jax.envs.playground_env import own_config, time_limit
+
+        return time_limit(own_config(env))
     limit = getattr(env, "max_episode_steps", None) or getattr(
         getattr(env, "spec", None), "max_episode_steps", None
     )

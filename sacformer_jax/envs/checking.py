@@ -152,7 +152,7 @@ class _Check:
             )
         structure, wanted_structure = jax.tree.structure(tree), jax.tree.structure(other)
         self.require(
-            str(structure) == str(wanted_structure),
+            structure == wanted_structure,
             f"{what} differs from {other_what}: {structure}, there {wanted_structure}",
         )
 

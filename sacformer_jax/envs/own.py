@@ -20,8 +20,9 @@ def register_env(name: str, env: Any, replace: bool = False) -> None:
 
     Args:
       name: the new name, without a colon.
-      env: a :class:`Task`, an environment of our contract, a ``brax.envs.Env``, or a class or
-        function that makes one and needs no arguments; it is called when the name is first used.
+      env: a :class:`Task`, an environment of our contract, a ``brax.envs.Env``, an ``MjxEnv`` of
+        MuJoCo Playground, or a class or function that makes one and needs no arguments; it is
+        called when the name is first used.
       replace: whether it may take the place of one registered before.
 
     Raises:
@@ -71,8 +72,10 @@ def _adapted(found: Any, choice: EngineChoice, name: str) -> Env | None:
         return MujocoEnv(found, choice)
     if isinstance(getattr(found, "spec", None), EnvSpec):
         return found
-    from sacformer_jax.envs import brax_env
+    from sacformer_jax.envs import brax_env, playground_env
 
+    if playground_env.is_playground(found):
+        return playground_env.PlaygroundEnv(found, name=name)
     if isinstance(found, brax_env.brax_envs.Env):
         return brax_env.BraxEnv(found, name=name)
     return None
@@ -81,7 +84,7 @@ def _adapted(found: Any, choice: EngineChoice, name: str) -> Env | None:
 def _refusal(found: Any) -> str:
     known = (
         "must be a Task, an environment of sacformer_jax (reset, step and an EnvSpec as spec), a "
-        "brax.envs.Env, or a class or function that makes one"
+        "brax.envs.Env, an MjxEnv of MuJoCo Playground, or a class or function that makes one"
     )
     kind = f"is of type {type(found).__module__}.{type(found).__qualname__}; {known}"
     if hasattr(found, "action_space"):

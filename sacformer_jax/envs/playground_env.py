@@ -55,7 +55,7 @@ def task_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
     Raises:
       ConfigError: Playground is not installed or has no such task.
     """
-    limit = _time_limit(_default_config(name))
+    limit = time_limit(_default_config(name))
     layers = [Layer("the task's own episode length", {"max_episode_steps": limit})]
     if name in _playground().dm_control_suite.ALL_ENVS:
         # Rewards are at most 1 there, whatever the task.
@@ -74,29 +74,34 @@ class PlaygroundEnv(JaxEnv):
     configuration has an ``action_repeat``, a step of ours is as many of its own.
 
     Args:
-      name: Playground's name, e.g. ``"CheetahRun"``.
-      mjx_impl: implementation of MJX: ``"jax"``.
+      env: Playground's name, e.g. ``"CheetahRun"``; or an ``mjx_env.MjxEnv`` of one's own.
+      mjx_impl: implementation of MJX: ``"jax"``; one's own has chosen.
+      name: what one's own is called.
 
     Raises:
       ConfigError: Playground or the task's robot is not there, there is no such task, its
         observations are not one vector, or ``mjx_impl`` is another one.
     """
 
-    def __init__(self, name: str, mjx_impl: str = "jax"):
-        config = _default_config(name)
-        _check_impl(mjx_impl)
-        overrides = {"impl": mjx_impl} if "impl" in config else {}
-        self._env = _load(name, overrides)
+    def __init__(self, env: str | Any, mjx_impl: str = "jax", name: str | None = None):
+        if isinstance(env, str):
+            config, name = _default_config(env), f"playground:{env}"
+            _check_impl(mjx_impl)
+            overrides = {"impl": mjx_impl} if "impl" in config else {}
+            self._env = _load(env, overrides)
+        else:
+            config, name = own_config(env), name or type(env).__name__
+            self._env = env
         self._action_repeat = int(config.get("action_repeat", 1))
         size = int(self._env.action_size)
         state = jax.eval_shape(self._env.reset, jax.random.key(0))
         self.spec = EnvSpec(
-            name=f"playground:{name}",
+            name=name,
             obs_size=_checked_obs_size(name, state.obs),
             action_size=size,
             action_low=(-1.0,) * size,  # as Playground's own training bounds them
             action_high=(1.0,) * size,
-            max_episode_steps=_time_limit(config),
+            max_episode_steps=time_limit(config),
             engine="mjx",
             engine_reason="as Playground has it; impl jax",
         )
@@ -139,9 +144,22 @@ def _default_config(name: str) -> Any:
     return _playground().registry.get_default_config(name)
 
 
-def _time_limit(config: Any) -> int:
-    """In steps of ours."""
-    return -(-int(config.episode_length) // int(config.get("action_repeat", 1)))
+def is_playground(env: Any) -> bool:
+    """Whether it is an ``mjx_env.MjxEnv``; Playground is not imported to find out."""
+    return any(
+        base.__module__.startswith("mujoco_playground.") and base.__name__ == "MjxEnv"
+        for base in type(env).__mro__
+    )
+
+
+def own_config(env: Any) -> Any:
+    """The configuration that an ``mjx_env.MjxEnv`` was made with."""
+    return env._config
+
+
+def time_limit(config: Any) -> int:
+    """In steps of ours; 1,000 of Playground's where a configuration says nothing."""
+    return -(-int(config.get("episode_length", 1_000)) // int(config.get("action_repeat", 1)))
 
 
 def _load(name: str, overrides: dict[str, str]) -> Any:
@@ -166,12 +184,12 @@ def _checked_obs_size(name: str, obs: Any) -> int:
     if isinstance(obs, Mapping):
         shapes = ", ".join(f"{key} {tuple(value.shape)}" for key, value in obs.items())
         raise ConfigError(
-            f"env='playground:{name}': observations are a dictionary ({shapes}); what can be taken "
+            f"env={name!r}: observations are a dictionary ({shapes}); what can be taken "
             "is one vector"
         )
     if len(obs.shape) != 1:
         raise ConfigError(
-            f"env='playground:{name}': observations have shape {obs.shape}; what can be taken is "
+            f"env={name!r}: observations have shape {obs.shape}; what can be taken is "
             "one vector"
         )
     return int(obs.shape[0])
