@@ -12,6 +12,7 @@ import numpy as np
 
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.envs.gym_registry import registered
 from sacformer_jax.offline import Episode
 
 
@@ -129,7 +130,7 @@ def write_episodes(
         minari.create_dataset_from_buffers(
             dataset_id,
             buffer=buffers,
-            env=None if spec.gymnasium_id is None else gymnasium.spec(spec.gymnasium_id),
+            env=_env_spec(spec),
             observation_space=gymnasium.spaces.Box(-unbounded, unbounded, dtype=np.float32),
             action_space=gymnasium.spaces.Box(*bounds, dtype=np.float32),
             algorithm_name=algorithm,
@@ -159,3 +160,11 @@ def check_dataset_id(dataset_id: str) -> None:
 
 def _at_the_end(episode: Episode, flag: bool) -> list[bool]:
     return [False] * (len(episode) - 1) + [flag]
+
+
+def _env_spec(spec: EnvSpec) -> Any:
+    """What a dataset says of the environment it is of; None where that cannot be written down."""
+    if spec.gymnasium_id is None:
+        return None
+    found = registered(spec.gymnasium_id)
+    return None if callable(found.entry_point) else found
