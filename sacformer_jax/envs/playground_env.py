@@ -201,5 +201,3 @@ def _check_impl(mjx_impl: str) -> None:
             "mjx_impl='warp': states of warp hold the contacts of all environments together, which "
             "cannot be reset one by one; playground:NAME runs with mjx_impl=jax"
         )
-    if mjx_impl != "jax":
-        raise ConfigError(f"mjx_impl={mjx_impl!r}: playground:NAME runs with mjx_impl=jax")
