@@ -343,7 +343,9 @@ def test_ours_through_braxs_view_and_back_is_the_same():
 # --- the page ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["reach_task.py", "reach.xml", "swing_up_env.py"])
+@pytest.mark.parametrize(
+    "name", ["reach_task.py", "reach.xml", "swing_up_env.py", "slider_playground.py"]
+)
 def test_the_page_shows_the_examples_as_they_are(name):
     text = (EXAMPLES / name).read_text()
     assert text in (ROOT / "docs" / "own_task.md").read_text()

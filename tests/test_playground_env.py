@@ -174,3 +174,18 @@ def test_cheetah_run_in_a_vector_env_and_its_physics_breaking_down(package):
     _, out = step(state.replace(env=state.env.replace(data=broken)), jnp.zeros((2, 6)))
     assert out.bad.tolist() == out.truncated.tolist() == [False, True]
     assert not np.any(out.terminated)
+
+
+def test_an_environment_of_ones_own_is_named_by_its_module(package):
+    config = Config.from_preset("cpu", env="slider_playground:Slider", agent="sac")
+    assert config.task.max_episode_steps == 100
+    env = make_env("slider_playground:Slider")
+    assert (env.spec.name, env.spec.obs_size, env.spec.engine) == (
+        "slider_playground:Slider", 2, "mjx",
+    )  # fmt: skip
+    assert make_env(env._env).spec.name == "Slider"
+    state, step = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(0))[0], jnp.ones(1))
+    position = float(state.data.qpos[0])
+    assert float(step.reward) == pytest.approx(np.exp(-4 * position**2), rel=1e-5)
+    np.testing.assert_allclose(step.obs, [position, state.data.qvel[0]], rtol=1e-6)
+    assert not step.terminated

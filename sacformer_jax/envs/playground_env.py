@@ -189,8 +189,7 @@ def _checked_obs_size(name: str, obs: Any) -> int:
         )
     if len(obs.shape) != 1:
         raise ConfigError(
-            f"env={name!r}: observations have shape {obs.shape}; what can be taken is "
-            "one vector"
+            f"env={name!r}: observations have shape {obs.shape}; what can be taken is one vector"
         )
     return int(obs.shape[0])
 
