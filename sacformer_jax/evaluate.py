@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import flax.struct
@@ -32,12 +33,70 @@ class Evaluation:
 
 
 @flax.struct.dataclass
-class _Progress:
+class Episodes:
+    """One episode in each of N environments, on their way.
+
+    Attributes:
+      env: the environments; those whose episode has ended go on with others, which do not count.
+      context: the acting contexts.
+      key: typed PRNG key of acting.
+      running: bool ``[N]``, whose episode has not ended.
+      result: what there is of it so far.
+    """
+
     env: VectorEnvState
     context: Context
     key: jax.Array
     running: jax.Array
     result: Evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeFunctions:
+    """Evaluation's episodes as pure functions, for whoever wants to look at their steps.
+
+    Attributes:
+      start: ``(key) -> Episodes``.
+      step: ``(policy, Episodes) -> Episodes``, under the policy's mean actions.
+    """
+
+    start: Callable[[jax.Array], Episodes]
+    step: Callable[[PolicyState, Episodes], Episodes]
+
+
+def episode_functions(env: VectorEnv, agent: Agent, context_length: int) -> EpisodeFunctions:
+    """The functions that :func:`make_evaluator` is made of."""
+
+    def start(key: jax.Array) -> Episodes:
+        env_state = env.init(key)
+        cache = agent.init_cache(env.num_envs)
+        return Episodes(
+            env=env_state,
+            context=contexts.start(env_state.obs, context_length, env.spec.action_size, cache),
+            key=jax.random.fold_in(key, _ACTING_STREAM),
+            running=jnp.ones(env.num_envs, bool),
+            result=Evaluation(
+                returns=jnp.zeros(env.num_envs), lengths=jnp.zeros(env.num_envs, jnp.int32)
+            ),
+        )
+
+    def step(policy: PolicyState, episodes: Episodes) -> Episodes:
+        key, act_key = jax.random.split(episodes.key)
+        acted = agent.act(policy, episodes.context, act_key, explore=False)
+        env_state, step = env.step(episodes.env, acted.action)
+        reward = jnp.where(episodes.running, step.reward, 0.0)
+        return Episodes(
+            env=env_state,
+            context=contexts.advance(acted, step.next_obs, step.reward, step.done),
+            key=key,
+            running=episodes.running & ~step.done,
+            result=Evaluation(
+                returns=episodes.result.returns + reward,
+                lengths=episodes.result.lengths + episodes.running,
+            ),
+        )
+
+    return EpisodeFunctions(start, step)
 
 
 def make_evaluator(
@@ -47,41 +106,15 @@ def make_evaluator(
 
     Actions are the policy's mean actions. Jitted; stops when the last episode ends.
     """
-
-    def step(policy: PolicyState, progress: _Progress) -> _Progress:
-        key, act_key = jax.random.split(progress.key)
-        acted = agent.act(policy, progress.context, act_key, explore=False)
-        env_state, step = env.step(progress.env, acted.action)
-        reward = jnp.where(progress.running, step.reward, 0.0)
-        return _Progress(
-            env=env_state,
-            context=contexts.advance(acted, step.next_obs, step.reward, step.done),
-            key=key,
-            running=progress.running & ~step.done,
-            result=Evaluation(
-                returns=progress.result.returns + reward,
-                lengths=progress.result.lengths + progress.running,
-            ),
-        )
+    functions = episode_functions(env, agent, context_length)
 
     @jax.jit
     def evaluate(policy: PolicyState, key: jax.Array) -> Evaluation:
-        env_state = env.init(key)
-        cache = agent.init_cache(env.num_envs)
-        progress = _Progress(
-            env=env_state,
-            context=contexts.start(env_state.obs, context_length, env.spec.action_size, cache),
-            key=jax.random.fold_in(key, _ACTING_STREAM),
-            running=jnp.ones(env.num_envs, bool),
-            result=Evaluation(
-                returns=jnp.zeros(env.num_envs), lengths=jnp.zeros(env.num_envs, jnp.int32)
-            ),
+        episodes = jax.lax.while_loop(
+            lambda episodes: any_of_all(episodes.running),
+            lambda episodes: functions.step(policy, episodes),
+            functions.start(key),
         )
-        progress = jax.lax.while_loop(
-            lambda progress: any_of_all(progress.running),
-            lambda progress: step(policy, progress),
-            progress,
-        )
-        return progress.result
+        return episodes.result
 
     return evaluate

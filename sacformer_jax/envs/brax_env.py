@@ -70,6 +70,11 @@ class BraxEnv(JaxEnv):
             raise ConfigError(f"brax_backend={backend!r}: must be one of {', '.join(BACKENDS)}")
         return brax_envs.get_environment(name, backend=backend)
 
+    @property
+    def brax(self) -> brax_envs.Env:
+        """The environment itself."""
+        return self._env
+
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         state = self._env.reset(key)
         return state, state.obs
