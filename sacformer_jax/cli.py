@@ -1,4 +1,4 @@
-"""The command line: ``sacformer train | resume | evaluate | collect | report | …``."""
+"""The command line: ``sacformer train | resume | evaluate | render | plot | report | …``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Annotated
 import jax
 import tyro
 
-from sacformer_jax import commands, compilation_cache
+from sacformer_jax import commands, compilation_cache, picture_commands
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.launch import Launch, choose_xla_threads
@@ -38,6 +38,8 @@ commands (each has --help):
   train      train a policy in a new run folder
   resume     continue a run from its newest checkpoint
   evaluate   evaluate a run's policy, here or in Gymnasium
+  render     make a video of a run's policy
+  plot       draw the pictures of a run, or compare several
   collect    write a policy's episodes as a Minari dataset
   report     write an HTML page about one or several runs
   describe   print every setting and where it comes from, or a run's state
@@ -73,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "train": _train,
         "resume": _resume,
         "evaluate": commands.evaluate,
+        "render": picture_commands.render,
+        "plot": picture_commands.plot,
         "collect": commands.collect,
         "report": commands.report,
         "describe": _describe,

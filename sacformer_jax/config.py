@@ -69,6 +69,8 @@ class RunConfig:
     """Environment steps between evaluations."""
     eval_episodes: int = 4
     """Episodes of each evaluation, under the mean action."""
+    video_every: int = 0
+    """Environment steps between videos (made at evaluations, of the first seed); 0: none."""
     checkpoint_every: int = 20_000
     """Environment steps between checkpoints."""
     checkpoint_replay: bool = True

@@ -156,12 +156,17 @@ def attend(
     return _attend_forward(query, key, value, mask, keep)[0]
 
 
+def attention_weights(query: jax.Array, key: jax.Array, mask: jax.Array) -> jax.Array:
+    """What :func:`attend` mixes the values with: float32 ``[B, H, S, T]``, rows that sum to 1."""
+    scores = jnp.einsum("bhsd,bhtd->bhst", query, key).astype(jnp.float32)
+    scores = jnp.where(mask[:, None], scores / math.sqrt(query.shape[-1]), _MASKED)
+    return jax.nn.softmax(scores, axis=-1)
+
+
 def _attend_forward(
     query: jax.Array, key: jax.Array, value: jax.Array, mask: jax.Array, keep: jax.Array | None
 ) -> tuple[jax.Array, Residuals]:
-    scores = jnp.einsum("bhsd,bhtd->bhst", query, key).astype(jnp.float32)
-    scores = jnp.where(mask[:, None], scores / math.sqrt(query.shape[-1]), _MASKED)
-    weights = jax.nn.softmax(scores, axis=-1)
+    weights = attention_weights(query, key, mask)
     kept = (weights if keep is None else weights * keep).astype(value.dtype)
     mixed = jnp.einsum("bhst,bhtd->bhsd", kept, value)
     return mixed, (query, key, value, weights, keep)

@@ -44,7 +44,7 @@ def learning_curve(records: list[Record], path: Path, title: str) -> None:
         axes.plot(
             steps, mean, color="tab:blue", marker="o", markersize=3, label="evaluation (mean ± std)"
         )
-    axes.set(xlabel="environment steps", ylabel="episode return", title=title)
+    axes.set(xlabel="environment steps", ylabel="episode return (reward)", title=title)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     if episodes or evaluations:
@@ -71,8 +71,8 @@ def comparison(rows: list[Record], path: Path, title: str) -> None:
     FigureCanvasAgg(figure)
     for axes, env in zip(figure.subplots(1, len(envs), squeeze=False)[0], envs, strict=True):
         for place, variant in enumerate(variants):
-            # Ten colours; further variants differ by their dashes.
-            color, dashes = f"C{place % 10}", _DASHES[place // 10 % len(_DASHES)]
+            # Dashes tell apart in grey, too, and those whose colours (there are ten) are the same.
+            color, dashes = f"C{place % 10}", _DASHES[(place + place // 10) % len(_DASHES)]
             curves: dict[str, dict[int, float]] = {}
             for row in rows:
                 if (row["env"], row["variant"]) == (env, variant):
@@ -91,6 +91,7 @@ def comparison(rows: list[Record], path: Path, title: str) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         if not many:
             axes.legend(frameon=False)
+    figure.axes[0].set_ylabel("evaluation return (reward)")
     if many:
         handles = {
             label: line

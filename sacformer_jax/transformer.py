@@ -13,7 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend
+from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend, attention_weights
 
 ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
 EVERY_TOKEN = (0, 1)
@@ -107,7 +107,10 @@ class Block(nn.Module):
             )
         every = seen if past is None else past.followed_by(seen)
         factors = dropout.factors((batch, cfg.heads, *mask.shape[1:]))
-        mixed = attend(split_heads(q), every.key, every.value, mask, factors)
+        q = split_heads(q)
+        if self.is_mutable_collection("intermediates"):  # for who asks; training does not
+            self.sow("intermediates", "attention", attention_weights(q, every.key, mask))
+        mixed = attend(q, every.key, every.value, mask, factors)
         mixed = mixed.swapaxes(1, 2).reshape(batch, -1, width)  # [B, S, D]
         x = x + dropout(project(width, "attention_out")(mixed))
 

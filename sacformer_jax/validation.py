@@ -45,7 +45,7 @@ def check(config: Config) -> None:
     for name in (
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
         "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
-        "value_coefficient", "pretrain_updates",
+        "value_coefficient", "pretrain_updates", "video_every",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _check_seeds(config)

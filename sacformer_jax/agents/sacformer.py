@@ -12,10 +12,10 @@ from sacformer_jax.parallel import DataAxis
 from sacformer_jax.transformer import TransformerConfig
 
 
-def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
-    """Builds SACFormer for an environment."""
+def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
+    """The actor that a configuration and an environment ask for, as it is trained."""
     settings = config.actor
-    actor = TransformerActor(
+    return TransformerActor(
         config=TransformerConfig(
             layers=settings.actor_layers,
             width=settings.actor_width,
@@ -31,9 +31,19 @@ def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
     )
-    acting_actor = actor
+
+
+def acting_pairs(config: Config, spec: EnvSpec) -> int:
+    """How many (return, state) pairs it sees at most in acting."""
+    if config.context.acting_context == "window":
+        return config.context.context_length
+    steps = spec.max_episode_steps
+    return min(config.context.acting_context_limit or steps, steps)
+
+
+def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
+    """Builds SACFormer for an environment."""
+    actor = acting_actor = make_actor(config, spec)
     if config.context.acting_context == "episode":
-        steps = spec.max_episode_steps
-        limit = min(config.context.acting_context_limit or steps, steps)
-        acting_actor = actor.clone(context_length=limit, cached=True)
+        acting_actor = actor.clone(context_length=acting_pairs(config, spec), cached=True)
     return make_sac_agent(sac_parts(config, spec, data, actor, acting_actor))
