@@ -1,9 +1,9 @@
 """SACFormer: Soft Actor-Critic with a Decision-Transformer actor, end to end in JAX.
 
 For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :func:`load_policy`,
-:func:`export_policy`, :func:`collect`, :func:`extract`, :func:`report`; with :class:`Member` and
-:class:`Devices` of many members on many devices, and :class:`Callback` for your own code between
-chunks.
+:func:`export_policy`, :func:`collect`, :func:`extract`, :func:`render`, :func:`report`; with
+:class:`Member` and :class:`Devices` of many members on many devices, and :class:`Callback` for your
+own code between chunks.
 For environments of your own: :class:`Task`, :class:`MujocoEnv`, :class:`JaxEnv`,
 :func:`check_env`, :func:`register_env`; for ``brax.training`` on ours: :func:`as_brax`.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
@@ -36,6 +36,7 @@ from sacformer_jax.loop import DivergedError
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.policy import Policy, load_policy
 from sacformer_jax.population import Devices, Population, make_population
+from sacformer_jax.render import VideoEvery, render
 from sacformer_jax.report import report
 from sacformer_jax.results import RunResult
 from sacformer_jax.runner import resume, train
@@ -67,6 +68,7 @@ __all__ = [
     "StopWithoutProgress",
     "Task",
     "VectorEnv",
+    "VideoEvery",
     "__version__",
     "as_brax",
     "check_env",
@@ -81,6 +83,7 @@ __all__ = [
     "make_program",
     "policy_of",
     "register_env",
+    "render",
     "report",
     "resume",
     "seed_members",

@@ -37,7 +37,7 @@ def acting_attention(
       (return-to-go, state, with ``tokens="gsa"`` the action) of the pair p steps back, P being the
       pairs that acting sees at most, or T; and ``[T, A]`` the mean before tanh, as in acting.
     """
-    contexts = contexts.replace(cache={})
+    contexts = dataclasses.replace(contexts, cache={})
     if config.context.acting_context == "window":
         looked = _look(config, spec, policy, contexts, config.context.context_length)
         newest = looked.weights[:, :, :, -1].swapaxes(1, 2)  # [L, H, T, K, n]
@@ -46,7 +46,7 @@ def acting_attention(
     steps = jax.tree.map(lambda leaf: leaf[None, :, -1], contexts)  # [1, T]
     if config.context.context_length > 1:  # an action is known at the next step
         actions = jnp.roll(contexts.action[:, -2], -1, axis=0)
-        steps = steps.replace(action=actions[None])
+        steps = dataclasses.replace(steps, action=actions[None])
     pairs = acting_pairs(config, spec)
     looked = _look(config, spec, policy, steps, pairs)
     num_steps = steps.mask.shape[1]

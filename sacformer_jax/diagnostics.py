@@ -106,7 +106,7 @@ def diagnostics_sheet(groups: dict[str, list[list[Record]]], path: Path, title: 
     curves = {panel: by_label for panel, by_label in curves.items() if any(by_label.values())}
     rows = max(1, math.ceil(len(curves) / _COLUMNS))
     figure = _figure((4.0 * _COLUMNS, 2.5 * rows + (0.8 if len(groups) > 1 else 0.4)))
-    panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True).reshape(-1)
+    panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True).reshape(-1).tolist()
     for axes, (panel, by_label) in zip(panels, curves.items(), strict=False):
         for place, (label, members) in enumerate(by_label.items()):
             _draw_group(axes, members, label, _style(place, len(groups)))
@@ -134,9 +134,10 @@ def _draw_group(axes: Axes, members: list[Curve], label: str, style: dict[str, A
         return
     several = len(members) > 1
     for curve in members:
-        width = {"linewidth": 0.7, "alpha": 0.5} if several else {"linewidth": 1.2}
-        name = None if several else label
-        axes.plot(list(curve), list(curve.values()), **style, **width, label=name)
+        line, name = (0.7, None) if several else (1.2, label)
+        alpha = 0.5 if several else 1.0
+        values = list(curve.values())
+        axes.plot(list(curve), values, **style, linewidth=line, alpha=alpha, label=name)
     if several:
         common = sorted(set.intersection(*(set(curve) for curve in members)))
         means = [sum(curve[step] for curve in members) / len(members) for step in common]

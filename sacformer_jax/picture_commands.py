@@ -41,7 +41,8 @@ class RenderArgs:
 @dataclasses.dataclass(frozen=True)
 class PlotArgs:
     """Draw the pictures of a run (or compare several): returns, diagnostics and, of SACFormer, the
-    return achieved against the target and the attention over the context."""
+    return achieved against the target and the attention over the context.
+    """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of the runs."""
@@ -69,20 +70,21 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def render(args: list[str]) -> int:
     """``sacformer render``."""
-    from sacformer_jax import render as rendering
-    from sacformer_jax.frames import View
+    from sacformer_jax.model_renderer import View
+    from sacformer_jax.policy_renderer import Timing
+    from sacformer_jax.render import render as draw
     from sacformer_jax.run_folder import RunFolder
 
     parsed = tyro.cli(RenderArgs, args=args, prog="sacformer render")
     view = View(*parse_size(parsed.size), parsed.camera)
-    timing = rendering.Timing(parsed.fps, parsed.gif_seconds)
+    timing = Timing(parsed.fps, parsed.gif_seconds)
     names = [member.name for member in RunFolder(parsed.run).opened().read_config().members]
     each = parsed.member is None and len(names) > 1
     for member in names if each else [parsed.member]:
         to = parsed.to
         if each and to is not None:
             to = to.with_name(f"{to.stem}-{member}{to.suffix}")
-        drawn = rendering.render(
+        drawn = draw(
             parsed.run,
             to=to,
             episodes=parsed.episodes,

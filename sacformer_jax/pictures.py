@@ -19,8 +19,8 @@ from sacformer_jax.evaluate import Episodes, make_evaluator
 from sacformer_jax.logging import Record, read_records
 from sacformer_jax.plots import comparison, learning_curve
 from sacformer_jax.policy import Policy, load_policy
+from sacformer_jax.policy_renderer import is_return_conditioned
 from sacformer_jax.recording import Recorder
-from sacformer_jax.render import is_return_conditioned
 from sacformer_jax.run_folder import RunConfigFile, RunFolder
 from sacformer_jax.stored import CheckpointError
 from sacformer_jax.train import make_training_env
@@ -92,7 +92,7 @@ def draw_records(run: RunRecords, to: Path) -> list[Path]:
         drawn += [folder / "learning_curve.png", folder / "diagnostics.png"]
     if several:
         comparison(_rows(run, run.run.config.agent), to / "learning_curve.png", run.title)
-        agent = {run.run.config.agent: list(run.records.values())}
+        agent = {str(run.run.config.agent): list(run.records.values())}
         diagnostics_sheet(agent, to / "diagnostics.png", run.title)
         drawn += [to / "learning_curve.png", to / "diagnostics.png"]
     return drawn
@@ -152,9 +152,7 @@ def _compare(runs: list[RunRecords], to: Path) -> Iterator[Path]:
     title = " and ".join(dict.fromkeys(run.run.config.task.env for run in runs))
     comparison(rows, to / "comparison.png", "evaluations")
     yield to / "comparison.png"
-    groups = {
-        label: list(run.records.values()) for run, label in zip(runs, labels, strict=True)
-    }
+    groups = {label: list(run.records.values()) for run, label in zip(runs, labels, strict=True)}
     diagnostics_sheet(groups, to / "diagnostics.png", title)
     yield to / "diagnostics.png"
 
@@ -173,9 +171,7 @@ def _labels(runs: list[RunRecords]) -> list[str]:
 # --- what a policy does --------------------------------------------------------------------------
 
 
-def draw_policy(
-    policy: Policy, to: Path, episodes: int, seed: int, title: str
-) -> Iterator[Path]:
+def draw_policy(policy: Policy, to: Path, episodes: int, seed: int, title: str) -> Iterator[Path]:
     """Draws what a SACFormer policy does: ``target_return.png`` (where the actor is conditioned on
     returns) and ``attention.png``.
     """
@@ -211,7 +207,7 @@ def returns_for_targets(
     evaluate = make_evaluator(env, policy.agent, policy.config.context.context_length)
     key = jax.random.key(seed)
     results = [
-        evaluate(policy.state.replace(target_return=jnp.float32(target)), key).returns
+        evaluate(dataclasses.replace(policy.state, target_return=jnp.float32(target)), key).returns
         for target in targets
     ]
     return np.stack([np.asarray(result) for result in results])
@@ -237,7 +233,7 @@ def mean_attention(policy: Policy, seed: int = 0) -> MeanAttention:
     env = make_training_env(config, num_envs=1)
 
     def look(episodes: Episodes) -> Any:
-        return episodes.context.replace(cache={})
+        return dataclasses.replace(episodes.context, cache={})
 
     recorder = Recorder(env, policy.agent, config.context.context_length, look)
     contexts = jax.tree.map(lambda leaf: leaf[:, 0], recorder.record(policy.state, seed).seen)

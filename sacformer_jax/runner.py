@@ -17,15 +17,16 @@ from sacformer_jax.cores import usable_cores
 from sacformer_jax.datasets import described, read_episodes
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
-from sacformer_jax.logging import Record, read_records, write_csv
+from sacformer_jax.logging import read_records, write_csv
 from sacformer_jax.loop import Loop
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.memory import available_bytes, check_fits
 from sacformer_jax.offline import Episode, check_episodes, with_dataset
-from sacformer_jax.plots import comparison, learning_curve
+from sacformer_jax.pictures import RunRecords, draw_records
 from sacformer_jax.population import Devices, Population, make_population
 from sacformer_jax.presets import resolve
 from sacformer_jax.processes import all_here, gathered, is_first
+from sacformer_jax.render import VideoEvery, check_drawable
 from sacformer_jax.results import RunResult
 from sacformer_jax.types import TrainState
 
@@ -74,6 +75,8 @@ def train(
     population = make_population(config, members, devices or Devices.for_members(len(members)))
     check_memory(population)
     dataset_of(population)  # what is wrong with it is said before anything is written
+    if config.run.video_every and is_first():
+        check_drawable(population.program.env.env)
     folder = RunFolder(new_run_path(config))
     sources = sources or sources_of(config)
 
@@ -238,7 +241,10 @@ def _train_on(
     state: TrainState,
     progress: Progress | None,
 ) -> RunResult:
-    callbacks, result = Callbacks(given, population, folder.path), None
+    every, own = population.config.run.video_every, []
+    if every:
+        own.append(VideoEvery(every, say=reporter.say))
+    callbacks, result = Callbacks([*given, *own], population, folder.path), None
     sources = folder.read_config().sources
     callbacks.start(int(state.counters.env_steps), progress is not None, sources)
     try:
@@ -254,7 +260,7 @@ def _train_on(
 def _finished(
     population: Population, folder: RunFolder, reporter: Reporter, loop: Loop, env_steps: int
 ) -> RunResult:
-    """Draws and says what came of it."""
+    """Writes tables and pictures of what came of it, and says it."""
     all_here()
     records = {
         member.name: read_records(folder.metrics_path(member.name)) for member in population.members
@@ -264,7 +270,10 @@ def _finished(
         for name, rows in records.items()
     }
     if is_first():
-        _draw(population, folder, records, evaluations)
+        for name, own in records.items():
+            for kind in ("train", "eval"):
+                write_csv(own, kind, folder.member_path(name) / f"{kind}.csv")
+        draw_records(RunRecords(folder, folder.read_config(), records), folder.path)
     over = env_steps >= population.config.run.total_env_steps
     reporter.closing(loop.started, folder, env_steps, not over, evaluations)
     several = len(records) > 1
@@ -275,29 +284,6 @@ def _finished(
     ]
     stopped = loop.callbacks.stop and not over
     return RunResult(folder.path, env_steps, rows, not over and not stopped, stopped)
-
-
-def _draw(
-    population: Population,
-    folder: RunFolder,
-    records: dict[str, list[Record]],
-    evaluations: dict[str, list[Record]],
-) -> None:
-    """Tables and a learning curve for each member, and one picture of them all."""
-    config = population.config
-    what = f"{config.agent} on {config.task.env}"
-    for member in population.members:
-        path, own = folder.member_path(member.name), records[member.name]
-        for kind in ("train", "eval"):
-            write_csv(own, kind, path / f"{kind}.csv")
-        learning_curve(own, path / "learning_curve.png", f"{what}, seed {member.seed}")
-    if len(records) > 1:
-        rows = [
-            {"env": config.task.env, "variant": config.agent, "seed": name, **record}
-            for name, own in evaluations.items()
-            for record in own
-        ]
-        comparison(rows, folder.path / "learning_curve.png", what)
 
 
 def sources_of(config: Config) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -173,7 +174,7 @@ class GifWriter:
         # GIFs count in hundredths of a second: rounded where each starts, so nothing adds up.
         end = min(self._num, int(np.ceil(self._seconds * self._fps)))
         hundredths = [round(100 * place / self._fps) for place in (*self._starts, end)]
-        durations = [10 * max(2, b - a) for a, b in zip(hundredths, hundredths[1:], strict=False)]
+        durations = [10 * max(2, b - a) for a, b in itertools.pairwise(hundredths)]
         palette = _common_palette(self._images)
         frames = [
             image.quantize(palette=palette, dither=Image.Dither.NONE) for image in self._images
