@@ -12,9 +12,6 @@ import tyro
 
 from sacformer_jax.presets import Resolved
 
-NEWER = "default (newer than the run)"
-"""Source of a setting that there was not yet when the run was made."""
-
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateArgs:
@@ -219,10 +216,10 @@ def describe_run(args: list[str]) -> int:
 
 
 def print_config(resolved: Resolved) -> None:
-    """Every setting and where it comes from; of an older run also those it knew nothing of."""
+    """Every setting and where it comes from."""
     for name, value in resolved.config.flat().items():
         shown = repr(value) if value in ("", None) else str(value)
-        print(f"{name:<24}{shown:<15} {resolved.sources.get(name, NEWER)}")
+        print(f"{name:<24}{shown:<15} {resolved.sources[name]}")
 
 
 def extract(args: list[str]) -> int:

@@ -42,7 +42,7 @@ class Reporter:
     """
 
     def __init__(self, quiet: bool = False):
-        self.console = Console(quiet=quiet, highlight=False, soft_wrap=True)
+        self.console = Console(quiet=quiet, highlight=False, soft_wrap=True, emoji=False)
         self._bar = Progress(
             TextColumn("{task.completed:,.0f}/{task.total:,.0f} env steps"),
             BarColumn(bar_width=30),

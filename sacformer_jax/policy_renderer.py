@@ -120,7 +120,7 @@ class PolicyRenderer:
         Raises:
           ConfigError: a page is asked for of what is not brax.
         """
-        page = getattr(self.source, "html", None)
+        page: Any = getattr(self.source, "html", None)
         pages = [path for path in paths if path.suffix == HTML_SUFFIX]
         if pages and page is None:
             raise ConfigError(
@@ -158,7 +158,8 @@ class PolicyRenderer:
                 so_far = float(recording.return_so_far[step, episode])
                 lines = caption(self._config, policy, step, so_far)
                 if num_episodes > 1:
-                    lines = (f"episode {episode + 1} of {num_episodes}", *lines)
+                    first, *others = lines
+                    lines = (f"episode {episode + 1} of {num_episodes}, {first}", *others)
                 return Frame(image, lines, num)
 
             for step in timing.steps(length, dt):
