@@ -74,6 +74,8 @@ class ModelRenderer:
     def draw(self) -> np.ndarray:
         """``[height, width, 3]`` uint8 of the positions in ``data``."""
         self._mujoco.mj_forward(self._model, self.data)
+        # Endless planes are laid around where the camera was at the update before: so twice.
+        self._renderer.update_scene(self.data, camera=self._camera)
         self._renderer.update_scene(self.data, camera=self._camera)
         return np.array(self._renderer.render())
 

@@ -137,7 +137,8 @@ class PolicyRenderer:
                 elif path.suffix == ".gif":
                     gif = GifWriter(path, fps, timing.gif_seconds)
                     writers.append(stack.enter_context(gif))
-            for frame in self._frames(recording, policy, timing) if writers else ():
+            frames = episode_frames(recording, policy, self.source, timing)
+            for frame in frames if writers else ():
                 for writer in writers:
                     writer.write(frame)
         for path in pages:
@@ -148,36 +149,46 @@ class PolicyRenderer:
             path.write_text(page(states, heading))
         return Rendering(tuple(paths), recording.returns, recording.lengths)
 
-    def _frames(self, recording: Recording, policy: Policy, timing: Timing) -> Iterator[Frame]:
-        """Every episode's frames; the last one stays a moment, with the return."""
-        num_episodes, dt = recording.lengths.size, self.source.dt
-        hold = max(1, round(HOLD_SECONDS * timing.frames_per_second(dt)))
-        for episode, length in enumerate(recording.lengths.tolist()):
 
-            def frame(image: np.ndarray, step: int, num: int = 1, episode: int = episode) -> Frame:
-                so_far = float(recording.return_so_far[step, episode])
-                lines = caption(self._config, policy, step, so_far)
-                if num_episodes > 1:
-                    first, *others = lines
-                    lines = (f"episode {episode + 1} of {num_episodes}, {first}", *others)
-                return Frame(image, lines, num)
+def episode_frames(
+    recording: Recording, policy: Policy, source: FrameSource, timing: Timing
+) -> Iterator[Frame]:
+    """Every episode's frames, one after the other; the last one stays a moment, with the return.
 
-            for step in timing.steps(length, dt):
-                image = self.source.draw(_seen(recording, step, episode))
-                yield frame(image, step)
-            yield frame(image, length, hold)
+    Args:
+      recording: E episodes, with the source's snapshots.
+      policy: what acted.
+      source: draws them.
+      timing: which steps are seen.
+    """
+    num_episodes, dt = recording.lengths.size, source.dt
+    hold = max(1, round(HOLD_SECONDS * timing.frames_per_second(dt)))
+    for episode, length in enumerate(recording.lengths.tolist()):
+
+        def frame(image: np.ndarray, step: int, num: int = 1, episode: int = episode) -> Frame:
+            so_far = float(recording.return_so_far[step, episode])
+            lines = caption(policy, step, so_far)
+            if num_episodes > 1:
+                first, *others = lines
+                lines = (f"episode {episode + 1} of {num_episodes}, {first}", *others)
+            return Frame(image, lines, num)
+
+        for step in timing.steps(length, dt):
+            image = source.draw(_seen(recording, step, episode))
+            yield frame(image, step)
+        yield frame(image, length, hold)
 
 
 def _seen(recording: Recording, step: int, episode: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[step, episode], recording.seen)
 
 
-def caption(config: Config, policy: Policy, step: int, return_so_far: float) -> tuple[str, ...]:
+def caption(policy: Policy, step: int, return_so_far: float) -> tuple[str, ...]:
     """What stands on a frame: time step, return so far and, where the actor is conditioned on it,
     the return-to-go it is shown and the target return.
     """
     lines = [f"step {step}", f"return {return_so_far:.1f}"]
-    if is_return_conditioned(config):
+    if is_return_conditioned(policy.config):
         target = float(policy.state.target_return)
         lines.append(f"return-to-go {target - return_so_far:.1f} of {target:.0f}")
     return tuple(lines)
