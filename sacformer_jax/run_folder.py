@@ -8,6 +8,7 @@ A run folder holds::
     damaged/STEP/      checkpoints that turned out to be damaged
     best/STEP/         Orbax: "policy", "metadata" of the best evaluation so far
     metrics.jsonl      see sacformer_jax.logging
+    videos/            see sacformer_jax.render
 
 With several members the last two lie in a folder for each, by its name.
 """

@@ -143,7 +143,7 @@ def test_captions_can_be_read_on_dark_and_on_light(background: int) -> None:
 
 def test_long_captions_are_made_smaller() -> None:
     blank = np.zeros((48, 400, 3), np.uint8)
-    lines = ("return-to-go 12345.6 of 123456, and more that is far too long",)
+    lines = ("return-to-go 12345.6 of 123456, and more that is far too long to be drawn large",)
     width = np.flatnonzero(captioned(blank, lines).any(axis=(0, 2))).max()
     assert width < 400
     short = np.flatnonzero(captioned(blank, ("far too long 1,",)).any(axis=(1, 2)))
