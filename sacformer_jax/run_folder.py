@@ -6,9 +6,9 @@ A run folder holds::
     lock               held while a process trains here
     checkpoints/STEP/  Orbax: "state" (everything), "policy" (of all members), "metadata"
     damaged/STEP/      checkpoints that turned out to be damaged
+    videos/            see sacformer_jax.render
     best/STEP/         Orbax: "policy", "metadata" of the best evaluation so far
     metrics.jsonl      see sacformer_jax.logging
-    videos/            see sacformer_jax.render
 
 With several members the last two lie in a folder for each, by its name.
 """
