@@ -21,7 +21,7 @@ XML = """
 
 
 class Slider(mjx_env.MjxEnv):
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__(config_dict.create(ctrl_dt=0.02, sim_dt=0.01, episode_length=100))
         self._mj_model = mujoco.MjModel.from_xml_string(XML)
         self._mjx_model = mjx.put_model(self._mj_model)

@@ -150,7 +150,8 @@ class _Check:
                 f"{what} differs from {other_what}: {path or 'it'} is {given}, there {wanted}; "
                 "both must have the same structure, shapes and types",
             )
-        structure, wanted_structure = jax.tree.structure(tree), jax.tree.structure(other)
+        structure: Any = jax.tree.structure(tree)
+        wanted_structure: Any = jax.tree.structure(other)
         self.require(
             structure == wanted_structure,
             f"{what} differs from {other_what}: {structure}, there {wanted_structure}",
