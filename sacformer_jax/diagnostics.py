@@ -96,6 +96,21 @@ def diagnostics_sheet(groups: dict[str, list[list[Record]]], path: Path, title: 
     Returns:
       The metrics drawn.
     """
+    sheet = diagnostics_figure(groups, title)
+    _save(sheet.figure, path)
+    return sheet.metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheet:
+    """A figure and the metrics that it shows."""
+
+    figure: Figure
+    metrics: list[str]
+
+
+def diagnostics_figure(groups: dict[str, list[list[Record]]], title: str) -> Sheet:
+    """What :func:`diagnostics_sheet` draws, to be written elsewhere."""
     curves = {
         panel: {
             label: [curve for records in members if (curve := _curve(records, panel))]
@@ -109,7 +124,7 @@ def diagnostics_sheet(groups: dict[str, list[list[Record]]], path: Path, title: 
     panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharex=True).reshape(-1).tolist()
     for axes, (panel, by_label) in zip(panels, curves.items(), strict=False):
         for place, (label, members) in enumerate(by_label.items()):
-            _draw_group(axes, members, label, _style(place, len(groups)))
+            _draw_group(axes, members, label, line_style(place, len(groups)))
         axes.set(title=panel.title, ylabel=panel.unit)
         if panel.log:
             _log_scale(axes)
@@ -117,7 +132,7 @@ def diagnostics_sheet(groups: dict[str, list[list[Record]]], path: Path, title: 
             axes.set_ylim(top=max(1.0, axes.get_ylim()[1]))
             axes.set_ylim(bottom=-0.05 * axes.get_ylim()[1])
     for number, axes in enumerate(panels):
-        _tidy(axes)
+        tidy(axes)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_visible(number < len(curves))
         if number + _COLUMNS >= len(curves):
@@ -125,8 +140,7 @@ def diagnostics_sheet(groups: dict[str, list[list[Record]]], path: Path, title: 
             axes.set_xlabel("environment steps")
     _legend_below(figure, panels[: len(curves)], len(groups))
     figure.suptitle(title)
-    _save(figure, path)
-    return [panel.name for panel in curves]
+    return Sheet(figure, [panel.name for panel in curves])
 
 
 def _draw_group(axes: Axes, members: list[Curve], label: str, style: dict[str, Any]) -> None:
@@ -169,7 +183,7 @@ def achieved_returns(
         capsize=3, label=f"mean ± std of {returns.shape[1]} episodes",
     )  # fmt: skip
     axes.set(xlabel="target return (reward)", ylabel="achieved return (reward)", title=title)
-    _tidy(axes)
+    tidy(axes)
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.legend(frameon=False, fontsize=9)
     _save(figure, path)
@@ -230,14 +244,14 @@ def _figure(size: tuple[float, float]) -> Figure:
     return figure
 
 
-def _style(place: int, num: int) -> dict[str, Any]:
+def line_style(place: int, num: int) -> dict[str, Any]:
     """Colours that get lighter from one to the next, and dashes: told apart in grey, too."""
     shade = 0.0 if num == 1 else 0.8 * place / (num - 1)
     color = "#0b3c5d" if num == 1 else matplotlib.colormaps["viridis"](shade)
     return {"color": color, "linestyle": _DASHES[place % len(_DASHES)]}
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.title.set_fontsize(11)

@@ -69,13 +69,18 @@ def own_limit(name: str) -> int | None:
     """The time limit of an own environment, in its steps, where it says one."""
     env = find(name)
     if hasattr(env, "mjx_model") and hasattr(env, "_config"):
-        from sacformer_jax.envs.playground_env import own_config, time_limit
-
-        return time_limit(own_config(env))
+        return playground_limit(env._config)
     limit = getattr(env, "max_episode_steps", None) or getattr(
         getattr(env, "spec", None), "max_episode_steps", None
     )
     return limit if isinstance(limit, int) else None
+
+
+def playground_limit(config: Any) -> int:
+    """Of a Playground environment's configuration, in steps of ours: ``action_repeat`` of its own;
+    1,000 of those where it says nothing.
+    """
+    return -(-int(config.get("episode_length", 1_000)) // int(config.get("action_repeat", 1)))
 
 
 def is_factory(found: Any) -> bool:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.env_names import playground_limit
 from sacformer_jax.envs.core import EnvSpec, EnvStep, JaxEnv
 from sacformer_jax.presets import Layer
 
@@ -55,7 +56,7 @@ def task_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
     Raises:
       ConfigError: Playground is not installed or has no such task.
     """
-    limit = time_limit(_default_config(name))
+    limit = playground_limit(_default_config(name))
     layers = [Layer("the task's own episode length", {"max_episode_steps": limit})]
     if name in _playground().dm_control_suite.ALL_ENVS:
         # Rewards are at most 1 there, whatever the task.
@@ -90,7 +91,7 @@ class PlaygroundEnv(JaxEnv):
             overrides = {"impl": mjx_impl} if "impl" in config else {}
             self._env = _load(env, overrides)
         else:
-            config, name = own_config(env), name or type(env).__name__
+            config, name = env._config, name or type(env).__name__
             self._env = env
         self._action_repeat = int(config.get("action_repeat", 1))
         size = int(self._env.action_size)
@@ -101,7 +102,7 @@ class PlaygroundEnv(JaxEnv):
             action_size=size,
             action_low=(-1.0,) * size,  # as Playground's own training bounds them
             action_high=(1.0,) * size,
-            max_episode_steps=time_limit(config),
+            max_episode_steps=playground_limit(config),
             engine="mjx",
             engine_reason="as Playground has it; impl jax",
         )
@@ -150,16 +151,6 @@ def is_playground(env: Any) -> bool:
         base.__module__.startswith("mujoco_playground.") and base.__name__ == "MjxEnv"
         for base in type(env).__mro__
     )
-
-
-def own_config(env: Any) -> Any:
-    """The configuration that an ``mjx_env.MjxEnv`` was made with."""
-    return env._config
-
-
-def time_limit(config: Any) -> int:
-    """In steps of ours; 1,000 of Playground's where a configuration says nothing."""
-    return -(-int(config.get("episode_length", 1_000)) // int(config.get("action_repeat", 1)))
 
 
 def _load(name: str, overrides: dict[str, str]) -> Any:

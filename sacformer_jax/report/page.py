@@ -13,6 +13,10 @@ from sacformer_jax.version import __version__
 
 VIDEO_LIMIT = 16 * 2**20
 """Bytes above which a video is named instead of embedded."""
+_TRAINING_CAPTION = (
+    "Means over a chunk's updates, and of episodes over those finished in it. Thin lines: single "
+    "members."
+)
 _NEVER_COMPARED = ("run_dir",)
 _STYLE = """
 :root { color-scheme: light; }
@@ -43,8 +47,7 @@ def html_page(runs: Sequence[Run]) -> str:
         _picture("Returns", returns_figure(runs), _returns_caption(runs)),
         _videos(runs),
         _faults(runs),
-        _picture("Training", metrics_figure(runs), "Means over a chunk's updates, and over the "
-                 "members; of episodes over those finished in it."),
+        _picture("Training", metrics_figure(runs), _TRAINING_CAPTION),
         _picture("Throughput", throughput_figure(runs), "Evaluations, checkpoints and compiling "
                  "are not in it."),
         _settings(runs),

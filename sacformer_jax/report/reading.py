@@ -90,6 +90,11 @@ class Run:
     video: Path | None
 
     @property
+    def records(self) -> dict[str, list[Record]]:
+        """Of both kinds, by member."""
+        return {name: [*own, *self.evaluations[name]] for name, own in self.train.items()}
+
+    @property
     def env_steps(self) -> int:
         """Environment steps done by each member, as far as metrics tell."""
         rows = [*self.train.values(), *self.evaluations.values()]
