@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs.core import Env
+from sacformer_jax.envs import Env, MujocoEnv
 from sacformer_jax.model_renderer import ModelRenderer, View
 
 
@@ -45,16 +45,24 @@ def frame_source(env: Env, view: View) -> FrameSource:
       ConfigError: nobody can; or there is no such camera; or this machine cannot draw.
     """
     from sacformer_jax.envs.brax_env import BraxEnv
-    from sacformer_jax.envs.mujoco_env import MujocoEnv
+    from sacformer_jax.envs.gym_env import GymEnv
+    from sacformer_jax.envs.playground_env import PlaygroundEnv
 
-    own = getattr(env, "frame_source", None)
-    if own is not None:
-        source: FrameSource = own(view)
-        return source
-    if isinstance(env, BraxEnv):
+    for candidate in (env, getattr(env, "brax", None)):
+        own = getattr(candidate, "frame_source", None)
+        if own is not None:
+            source: FrameSource = own(view)
+            return source
+    if isinstance(env, BraxEnv) and getattr(env.brax, "sys", None) is not None:
         return BraxFrames(env, view)
     if isinstance(env, MujocoEnv):
         return EngineFrames(env, view)
+    if isinstance(env, PlaygroundEnv):
+        return PlaygroundFrames(env, view)
+    if isinstance(env, GymEnv):
+        from sacformer_jax.gym_frames import GymFrames
+
+        return GymFrames(env, view)
     raise ConfigError(
         f"env={env.spec.name!r}: cannot be drawn; give the environment a method frame_source(view) "
         "that returns a sacformer_jax.frames.FrameSource"
@@ -124,6 +132,31 @@ class BraxFrames:
             "background:#000b;padding:.3em .6em;z-index:1"
         )
         return page.replace("<body>", f'<body><div style="{style}">{heading}</div>', 1)
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+class PlaygroundFrames:
+    """A task of MuJoCo Playground.
+
+    Args:
+      env: a :class:`~sacformer_jax.envs.playground_env.PlaygroundEnv`.
+      view: size and camera.
+    """
+
+    def __init__(self, env: Any, view: View):
+        self.dt = env.dt
+        self._renderer = ModelRenderer(env.playground.mj_model, view)
+
+    def snapshot(self, state: Any) -> Any:
+        data = state.data
+        return {name: getattr(data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
+
+    def draw(self, snapshot: Any) -> np.ndarray:
+        for name, value in snapshot.items():
+            getattr(self._renderer.data, name)[:] = value
+        return self._renderer.draw()
 
     def close(self) -> None:
         self._renderer.close()

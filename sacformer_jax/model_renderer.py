@@ -51,7 +51,7 @@ class ModelRenderer:
     """
 
     def __init__(self, model: Any, view: View):
-        mujoco = _mujoco_that_draws()
+        mujoco = mujoco_that_draws()
         self._mujoco, self._model = mujoco, copy.copy(model)
         visual = self._model.vis
         visual.global_.offwidth = max(visual.global_.offwidth, view.width)
@@ -129,7 +129,7 @@ def _camera(model: Any, wanted: str | int | None) -> Any:
 # --- OpenGL --------------------------------------------------------------------------------------
 
 
-def _mujoco_that_draws() -> Any:
+def mujoco_that_draws() -> Any:
     """MuJoCo with a way to draw: EGL, where nobody chose another and there is no display.
 
     MuJoCo chooses when it is imported, which happened long before; and there a missing library

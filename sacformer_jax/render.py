@@ -111,18 +111,16 @@ class VideoEvery(Callback):
         if env_steps < 1:
             raise ConfigError(f"env_steps={env_steps}: must be at least 1")
         self.every, self.member, self.view = env_steps, member, view or View(320, 240)
-        self._say = say
-        self._started = self._done = 0
+        self._say, self._done = say, -1
         self._renderer: PolicyRenderer | None = None
 
     def on_start(self, run: RunStart) -> None:
-        # Those up to here are there already, unless this is where the run starts: there is an
-        # evaluation then before any chunk.
-        self._started, self._done = run.env_steps, run.env_steps // self.every
+        # Of a resumed run those up to here are there already.
+        self._done = run.env_steps // self.every if run.resumed else -1
 
     def on_eval(self, event: Event) -> None:
         number = event.env_steps // self.every
-        if number <= self._done and event.env_steps != self._started:
+        if number <= self._done:
             return
         self._done = number
         path = event.path / "videos" / f"step_{event.env_steps}.mp4"

@@ -46,6 +46,7 @@ ARROW: tuple[tuple[str, ...], ...] = (
     ("plots", "diagnostics", "datasets", "console", "compilation_cache", "launch"),
     ("policy", "collecting", "results", "signals", "fault_report"),
     ("callbacks", "video", "model_renderer"),
+    ("gym_frames",),
     ("frames",),
     ("policy_renderer",),
     ("tracking", "render"),

@@ -16,12 +16,14 @@ import mujoco
 import numpy as np
 import pytest
 from PIL import Image
+from probe import PointEnv
 from untrained import STEPS, untrained_config, untrained_run
 
 from sacformer_jax import ConfigError, evaluate, load_policy, make_env, render, train
 from sacformer_jax import model_renderer as gl
 from sacformer_jax.cli import main
-from sacformer_jax.frames import BraxFrames, EngineFrames, frame_source
+from sacformer_jax.frames import BraxFrames, EngineFrames, PlaygroundFrames, frame_source
+from sacformer_jax.gym_frames import GymFrames
 from sacformer_jax.model_renderer import View
 from sacformer_jax.policy_renderer import PolicyRenderer, Timing, caption, episode_frames
 from sacformer_jax.recording import Recording
@@ -216,6 +218,48 @@ def test_the_floor_has_no_end() -> None:
     assert min(image.std() for image in seen) > 40  # squares, not the sky
 
 
+def test_playground_is_drawn() -> None:
+    pytest.importorskip("mujoco_playground")
+    env = make_env("playground:CartpoleBalance")
+    source = frame_source(env, SIZE)
+    assert isinstance(source, PlaygroundFrames)
+    assert source.dt == pytest.approx(0.01)
+    images = []
+    for position in (0.0, 1.0):
+        data = {"mocap_pos": np.zeros((0, 3)), "mocap_quat": np.zeros((0, 4))}
+        images.append(source.draw({**data, "qpos": np.array([position, 0.5])}).astype(int))
+    source.close()
+    assert np.abs(images[0] - images[1]).mean() > 1
+
+
+def test_gymnasium_draws_its_own_and_is_brought_to_the_state() -> None:
+    env = make_env("gym:InvertedPendulum-v5")
+    source = frame_source(env, SIZE)
+    assert isinstance(source, GymFrames)
+    assert source.dt == pytest.approx(0.04)
+    actions = np.zeros((env.spec.max_episode_steps, 1), np.float32)
+    actions[:6, 0] = [1, 1, -1, 1, 1, 1]
+
+    def at(length: int, seed: int = 3) -> np.ndarray:
+        state = {"seed": np.uint32(seed), "length": np.int32(length), "actions": actions}
+        return source.draw(state).astype(int)
+
+    first, later = at(0), at(6)  # from the reset, then six steps on
+    assert first.shape == (64, 64, 3)
+    assert np.abs(first - later).mean() > 0.5
+    assert np.any(at(2) != later)  # back: from a reset again
+    np.testing.assert_array_equal(at(6), later)
+    np.testing.assert_array_equal(at(0), first)
+    source.close()
+    with pytest.raises(ConfigError, match="camera='track'"):
+        frame_source(env, View(64, 48, "track"))
+
+
+def test_what_nobody_can_draw_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"env='point': cannot be drawn.*frame_source"):
+        frame_source(PointEnv(), SIZE)
+
+
 def test_an_environment_may_draw_itself() -> None:
     class Own:
         def frame_source(self, view: View) -> str:
@@ -296,7 +340,7 @@ def test_egl_is_chosen_where_there_is_no_display(
     monkeypatch.setattr(context, "GLContext", None)
     monkeypatch.setattr(gl.os, "environ", dict(environment))
     monkeypatch.setattr(gl.sys, "platform", "linux")
-    gl._mujoco_that_draws()
+    gl.mujoco_that_draws()
     assert gl.os.environ.get("MUJOCO_GL") == chosen
     assert (context.GLContext is not None) == (environment == {})
 

@@ -107,6 +107,16 @@ class PlaygroundEnv(JaxEnv):
             engine_reason="as Playground has it; impl jax",
         )
 
+    @property
+    def playground(self) -> Any:
+        """The environment itself."""
+        return self._env
+
+    @property
+    def dt(self) -> float:
+        """Seconds of a step."""
+        return float(self._env.dt) * self._action_repeat
+
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
         state = self._env.reset(key)
         return state, state.obs
