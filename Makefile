@@ -3,12 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
+SITE := docs/_build/html
 RUN ?= runs/halfcheetah
 FLAGS ?=
 JSON ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train resume bench test test-all lint types check clean
+.PHONY: help install train resume bench test test-all lint types docs notebooks linkcheck wheel check clean
 
 help:  ## what each target does
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -22,6 +24,9 @@ $(STAMP): pyproject.toml sacformer_jax/version.py
 	$(BIN)/python -m pip install --quiet --editable '.[dev]' && \
 	touch $@ && \
 	echo "installation took $$(($$(date +%s) - start)) s"
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --editable '.[docs]' && touch $@
 
 train: install  ## train SACFormer on HalfCheetah (15 minutes on 2 cores), then evaluate it in Gymnasium
 	$(BIN)/sacformer train --preset cpu --env HalfCheetah --run-dir $(RUN) $(FLAGS)
@@ -47,7 +52,10 @@ lint: install  ## ruff: errors, style, formatting
 types: install  ## mypy
 	$(BIN)/mypy
 
-check: test lint types  ## what CI runs
+docs: $(DOCS_STAMP)  ## the documentation as a site, docs/_build/html; warnings and broken links are errors
+	$(BIN)/python -m sphinx -W --keep-going -j auto -q docs $(SITE)
+	cd docs && ../$(BIN)/python -m site_tools.built_links _build/html
+	@echo "open $(SITE)/index.html"
 
 clean:  ## remove .venv and caches (runs/ stays)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info
