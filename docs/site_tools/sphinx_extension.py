@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
-from docutils.utils.math import MathError, wrap_math_code
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
@@ -62,7 +62,7 @@ class AttributeDocs:
 
 def _mathml(self: HTML5Translator, node: nodes.Element, block: bool) -> None:
     try:
-        self.body.append(tex2mathml(wrap_math_code(node.astext(), block), as_block=block))
+        self.body.append(tex2mathml(node.astext(), as_block=block))
     except MathError as error:
         _logger.warning("math %r: %s", node.astext(), error, location=node)
     raise nodes.SkipNode
