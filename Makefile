@@ -5,6 +5,11 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SITE := docs/_build/html
+# In the folder build/wheel, which holds nothing of the checkout.
+WHEEL := bin/sacformer
+TINY := --total-env-steps 1024 --prefill-env-steps 512 --chunk-env-steps 256 --eval-every 512 \
+	--eval-episodes 1 --buffer-capacity 20000 --num-envs 2 --batch-size 8 --updates-per-env-step 0.25 \
+	--actor-width 16 --actor-layers 1 --actor-heads 1 --critic-width 32
 RUN ?= runs/halfcheetah
 FLAGS ?=
 JSON ?=
@@ -52,10 +57,29 @@ lint: install  ## ruff: errors, style, formatting
 types: install  ## mypy
 	$(BIN)/mypy
 
-docs: $(DOCS_STAMP)  ## the documentation as a site, docs/_build/html; warnings and broken links are errors
+docs: $(DOCS_STAMP)  ## the documentation as a site in docs/_build/html; a warning or broken link is an error
 	$(BIN)/python -m sphinx -W --keep-going -j auto -q docs $(SITE)
-	cd docs && ../$(BIN)/python -m site_tools.built_links _build/html
+	cd docs && $(abspath $(BIN))/python -m site_tools.built_links _build/html
 	@echo "open $(SITE)/index.html"
 
+notebooks: $(DOCS_STAMP)  ## run the notebooks (a minute each)
+	cd docs && $(abspath $(BIN))/python -m site_tools.notebooks
+
+linkcheck: $(DOCS_STAMP)  ## look whether external links still lead somewhere (needs a network)
+	$(BIN)/python -m sphinx -b linkcheck -q docs docs/_build/linkcheck
+
+wheel: install  ## build sdist and wheel, install the wheel in an empty environment, and train with it
+	rm -rf dist build/wheel
+	$(BIN)/python -m build --outdir dist .
+	$(PYTHON) -m venv build/wheel
+	build/wheel/bin/python -m pip install --quiet dist/*.whl
+	cd build/wheel && $(WHEEL) --version
+	cd build/wheel && $(WHEEL) describe --preset paper --env Humanoid
+	cd build/wheel && $(WHEEL) train --env Hopper --run-dir run $(TINY)
+	cd build/wheel && $(WHEEL) evaluate run --gymnasium --episodes 2
+	rm -rf build/wheel
+
+check: test lint types docs notebooks wheel  ## what CI runs
+
 clean:  ## remove .venv and caches (runs/ stays)
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build dist docs/_build *.egg-info

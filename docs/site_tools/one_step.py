@@ -108,7 +108,9 @@ def rows(name: str) -> list[tuple[str, str, str]]:
             found.append((field, f"{len(leaves)} arrays, {size:,} numbers", "float32"))
             continue
         for path, leaf in jax.tree_util.tree_flatten_with_path(value)[0]:
-            inner = "".join(f".{getattr(entry, 'name', getattr(entry, 'key', ''))}" for entry in path)
+            inner = "".join(
+                f".{getattr(entry, 'name', getattr(entry, 'key', ''))}" for entry in path
+            )
             shape = f"[{', '.join(f'{size:,}' for size in leaf.shape)}]" if leaf.shape else "scalar"
             found.append((f"{field}{inner}", shape, str(leaf.dtype)))
     return found
