@@ -9,9 +9,10 @@ from site_tools.markdown_links import anchors, problems, slug
 
 ROOT = Path(__file__).resolve().parents[1]
 SKIPPED = {"_build", ".venv", "runs", "build", "dist", "node_modules"}
+FOLDERS = ("*.md", "docs/**/*.md", "docs/**/*.ipynb", "experiments/**/*.md", ".github/**/*.md")
 PAGES = sorted(
     path.relative_to(ROOT)
-    for pattern in ("*.md", "docs/**/*.md", "docs/**/*.ipynb", "experiments/**/*.md", ".github/**/*.md")
+    for pattern in FOLDERS
     for path in ROOT.glob(pattern)
     if not SKIPPED & set(path.relative_to(ROOT).parts)
 )
@@ -50,7 +51,7 @@ def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
         "[a](other.md#there) [b](other.md#gone) [c](gone.md) ![d](gone.png) [e](#here)\n\n"
-        "`tests/test_gone.py` and `other.md`; [f](https://example.com/#any)\n\n"
+        "`tests/test_gone.py` and `other.md`, `RUN/curve.png`; [f](https://example.com/#any)\n\n"
         "| [g](gone.csv) |\n| --- |\n| cell |\n\n## Here\n"
     )
     assert problems(page, tmp_path) == [

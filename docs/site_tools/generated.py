@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import itertools
 import os
 import re
 import textwrap
@@ -61,7 +62,7 @@ def field_docs(section: type) -> dict[str, str]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(section)))
     (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
     docs = {}
-    for field, below in zip(body, body[1:], strict=False):
+    for field, below in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
             assert isinstance(field.target, ast.Name)
             docs[field.target.id] = ast.literal_eval(below.value)
@@ -150,9 +151,12 @@ def help_text(arguments: list[str]) -> str:
     """What ``sacformer ARGUMENTS --help`` prints, without colours, 96 columns wide."""
     printed = io.StringIO()
     environment = {"COLUMNS": "96", "NO_COLOR": "1", "TERM": "dumb"}
-    with mock.patch.dict(os.environ, environment), contextlib.redirect_stdout(printed):
-        with contextlib.suppress(SystemExit):
-            cli.main([*arguments, "--help"])
+    with (
+        mock.patch.dict(os.environ, environment),
+        contextlib.redirect_stdout(printed),
+        contextlib.suppress(SystemExit),
+    ):
+        cli.main([*arguments, "--help"])
     lines = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).splitlines()
     return "\n".join(line.rstrip() for line in lines)
 

@@ -1,10 +1,11 @@
-"""Links and file names in the repository's own Markdown, as a reader of the repository follows them.
+"""Links and file names in the repository's Markdown, as a reader of the repository follows them.
 
 The site is checked when it is built; this looks at the files as they lie there, README.md included.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ from markdown_it.token import Token
 _ROOTS = (".", "sacformer_jax", "docs", "experiments")
 """Where a file named in the text may lie."""
 _NAMED = re.compile(r"^(?:[\w.-]+/)+[\w.-]+\.(?:py|md|json|csv|png|svg|sh|yml|toml|ipynb|cff)$")
+_STANDS_FOR = re.compile(r"\b(?:RUN|STUDY|NAME)\b")
+"""In a path that stands for many."""
 _ANCHOR = re.compile(r"^\((?P<name>[\w-]+)\)=$", re.MULTILINE)
 
 
@@ -46,7 +49,7 @@ def anchors(text: str) -> set[str]:
     found: set[str] = set()
     counts: dict[str, int] = {}
     tokens = list(MarkdownIt("commonmark").enable("table").parse(text))
-    for opening, inline in zip(tokens, tokens[1:], strict=False):
+    for opening, inline in itertools.pairwise(tokens):
         if opening.type == "heading_open":
             words = "".join(t.content for t in inline.children or () if t.type != "html_inline")
             name = slug(words)
@@ -63,6 +66,13 @@ def _shown(path: Path, root: Path) -> str:
     return (root / shown[1]).read_text() if shown else text
 
 
+def _is_there(text: str, root: Path) -> bool:
+    """Whether what stands in a code span is no path of a file, or one that exists."""
+    if not _NAMED.match(text) or _STANDS_FOR.search(text):
+        return True
+    return any((root / place / text).exists() for place in _ROOTS)
+
+
 def problems(path: Path, root: Path) -> list[str]:
     """A line for each link, picture or file name in a page that leads nowhere.
 
@@ -72,9 +82,8 @@ def problems(path: Path, root: Path) -> list[str]:
     """
     found = []
     for token in _tokens(text_of(path)):
-        if token.type == "code_inline" and _NAMED.match(token.content):
-            if not any((root / place / token.content).exists() for place in _ROOTS):
-                found.append(f"`{token.content}`: no such file")
+        if token.type == "code_inline" and not _is_there(token.content, root):
+            found.append(f"`{token.content}`: no such file")
         target = token.attrGet("href") or token.attrGet("src")
         if not isinstance(target, str) or re.match(r"[a-z]+:", target):
             continue
