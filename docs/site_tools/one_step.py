@@ -107,6 +107,9 @@ def rows(name: str) -> list[tuple[str, str, str]]:
             size = sum(leaf.size for leaf in leaves)
             found.append((field, f"{len(leaves)} arrays, {size:,} numbers", "float32"))
             continue
+        if name == "acted" and isinstance(value, Context):
+            found.append((field, "as above", ""))
+            continue
         for path, leaf in jax.tree_util.tree_flatten_with_path(value)[0]:
             inner = "".join(
                 f".{getattr(entry, 'name', getattr(entry, 'key', ''))}" for entry in path
@@ -141,8 +144,8 @@ def table(name: str) -> str:
 
 def with_tables(page: str) -> str:
     """The page with each table after its marker ``<!-- table: NAME -->`` as it is now."""
-    pattern = re.compile(r"(<!-- table: (\w+) -->\n\n)(?:\|[^\n]*\n)*")
-    return pattern.sub(lambda found: f"{found[1]}{table(found[2])}\n", page)
+    pattern = re.compile(r"(<!-- table: (\w+) -->\n\n)(?:\|[^\n]*\n)*\n*")
+    return pattern.sub(lambda found: f"{found[1]}{table(found[2])}\n\n", page)
 
 
 def main() -> None:
