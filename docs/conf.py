@@ -26,6 +26,8 @@ exclude_patterns = ["_build", "site_tools", "**.ipynb_checkpoints"]
 html_theme = "furo"
 html_title = f"sacformer-jax {__version__}"
 html_copy_source = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 4
