@@ -89,7 +89,7 @@ def _cell(text: str) -> str:
 def configuration() -> str:
     """A table of each section of the configuration, then what each preset sets and why."""
     hints = typing.get_type_hints(config.Config)
-    sections: dict[str, type] = {
+    sections: dict[str, Any] = {
         name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)
     }
     lines = ["## The top", "", f"{inspect.getdoc(config.Config)}", "", *_table(config.Config)]
