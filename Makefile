@@ -1,8 +1,10 @@
-# `make` prints the targets. Everything runs in .venv, which `install` makes and keeps current.
+# `make` prints the targets. Everything runs in .venv, which holds what was needed so far: the package
+# itself (train, resume), its tools (test, lint, …), the site's (docs, notebooks).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEV_STAMP := $(VENV)/.installed-dev
 DOCS_STAMP := $(VENV)/.installed-docs
 SITE := docs/_build/html
 # In the folder build/wheel, which holds nothing of the checkout.
@@ -20,24 +22,30 @@ JSON ?=
 help:  ## what each target does
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
-install: $(STAMP)  ## make .venv with the package and its tools (skipped when current)
+install: $(DEV_STAMP)  ## make .venv with the package and its tools (skipped when current)
 
 $(STAMP): pyproject.toml sacformer_jax/version.py
 	@echo "installing into $(VENV) …"; start=$$(date +%s); \
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed: make PYTHON=python3.11") if sys.version_info < (3, 11) else None' && \
 	$(PYTHON) -m venv $(VENV) && \
+	$(BIN)/python -m pip install --quiet --editable '.[video]' && \
+	touch $@ && \
+	echo "installation took $$(($$(date +%s) - start)) s"
+
+$(DEV_STAMP): $(STAMP)
+	@echo "installing the tools …"; start=$$(date +%s); \
 	$(BIN)/python -m pip install --quiet --editable '.[dev]' && \
 	touch $@ && \
 	echo "installation took $$(($$(date +%s) - start)) s"
 
-$(DOCS_STAMP): $(STAMP)
+$(DOCS_STAMP): $(DEV_STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[docs]' && touch $@
 
-train: install  ## train SACFormer on HalfCheetah (15 minutes on 2 cores), then evaluate it in Gymnasium
+train: $(STAMP)  ## train SACFormer on HalfCheetah (15 minutes on 2 cores), then evaluate it in Gymnasium
 	$(BIN)/sacformer train --preset cpu --env HalfCheetah --run-dir $(RUN) $(FLAGS)
 	$(BIN)/sacformer evaluate $(RUN) --gymnasium --episodes 10
 
-resume: install  ## continue `make train` where it stopped
+resume: $(STAMP)  ## continue `make train` where it stopped
 	$(BIN)/sacformer resume $(RUN)
 	$(BIN)/sacformer evaluate $(RUN) --gymnasium --episodes 10
 
