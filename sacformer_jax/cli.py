@@ -61,7 +61,7 @@ class ResumeArgs:
 
 @dataclasses.dataclass(frozen=True)
 class _ConfigArgs:
-    """What is read from the flags of ``train`` and ``describe``."""
+    """Settings of a run, where it runs and where it is tracked."""
 
     config: Config
     launch: Launch
