@@ -110,7 +110,10 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
     return (low + high) / 2 + (high - low) / 2 * np.tanh(np.asarray(gaussian.mean[0]))
 
 
-@pytest.mark.parametrize(("tokens", "limit"), [("gs", 1000), ("gsa", 1000), ("gsa", 100)])
+@pytest.mark.parametrize(
+    ("tokens", "limit"),
+    [("gs", 1000), pytest.param("gsa", 1000, marks=pytest.mark.slow), ("gsa", 100)],
+)
 def test_a_thousand_steps_equal_full_recomputation(tokens, limit):
     """Two environments whose episodes end at different steps; explored actions in the tokens."""
     config = acting_config(tokens=tokens, acting_context_limit=limit)

@@ -24,7 +24,7 @@ from sacformer_jax.envs.tasks import TASKS
 
 NUM_ENVS, NUM_STEPS, KEPT_EVERY = 8, 60, 6
 # Compiling MJX's step takes from a quarter of a minute (HalfCheetah) to one and a half (Humanoid).
-QUICK = ("HalfCheetah", "Hopper", "Ant")
+QUICK = ("Hopper", "Ant")
 EACH_TASK = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TASKS]
 # Largest differences allowed over NUM_ENVS * NUM_STEPS single environment steps: qpos and qvel
 # absolute, as are rewards; observations relative to 1 + their size.

@@ -184,6 +184,11 @@ def test_an_environment_of_ones_own_is_named_by_its_module(package):
         "slider_playground:Slider", 2, "mjx",
     )  # fmt: skip
     assert make_env(env._env).spec.name == "Slider"
+
+
+@pytest.mark.slow
+def test_an_environment_of_ones_own_steps(package):
+    env = make_env("slider_playground:Slider")
     state, step = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(0))[0], jnp.ones(1))
     position = float(state.data.qpos[0])
     assert float(step.reward) == pytest.approx(np.exp(-4 * position**2), rel=1e-5)

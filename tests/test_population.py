@@ -171,7 +171,7 @@ def _flops(program: Any, *arguments: Any) -> float:
     return float(program.lower(*arguments).compile().cost_analysis()["flops"])
 
 
-@pytest.mark.parametrize("task", ["native", "jax"])
+@pytest.mark.parametrize("task", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_members_cost_what_they_cost_alone(hopper: Config, task: str) -> None:
     config, env = (hopper, None) if task == "native" else (point_config(), PointEnv())
     alone = make_program(config, None if env is None else point_env(4))

@@ -366,6 +366,7 @@ TRAINING = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_videos_in_training_change_nothing_though_one_fails(
     tmp_path: Path, monkeypatch, capsys
 ) -> None:

@@ -276,8 +276,9 @@ TIMING_FIELDS = {
 
 def test_the_schema_is_documented() -> None:
     text = metric_logging.__doc__ or ""
-    train_text, rest = text.split('``kind = "train"``')[1].split('``kind = "eval"``')
-    eval_text, timing_text = rest.split("``timings.jsonl``")
+    train_text, rest = text.split('``kind = "train"``')[1].split('``kind = "pretrain"``')
+    eval_text, rest = rest.split('``kind = "eval"``')[1].split("``timings.jsonl``")
+    timing_text = rest.split("``train.csv``")[0]
     assert set(re.findall(r"``(\w+)``", train_text)) - {"null"} == TRAIN_FIELDS | PPO_FIELDS
     assert set(re.findall(r"``(\w+)``", eval_text)) == EVAL_FIELDS
     assert set(re.findall(r"``(\w+)``", timing_text)) - {"env_steps", "updates"} == TIMING_FIELDS

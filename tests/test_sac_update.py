@@ -235,12 +235,12 @@ def test_a_transformer_critic_learns_from_the_same_loss():
     next_action, next_log_prob = numpy_sample(
         jax.tree.map(lambda x: x[:, 1:], gaussian), jax.random.split(key, 3)[1]
     )
-    next_q = critics.following(
+    next_q = jax.jit(critics.following)(
         learner.target_critic_params, inputs, jnp.asarray(next_action, jnp.float32)
     ).min(0)
     alpha = float(jnp.exp(learner.log_alpha))
     y = window.reward + 0.99 * window.discount * (next_q - alpha * next_log_prob)
-    q = critics.now(learner.critic_params, inputs, window.action)
+    q = jax.jit(critics.now)(learner.critic_params, inputs, window.action)
     weight = window.weight[:, None] * window.bootstrap_mask
     expected = (weight * ((q - y) ** 2).sum(0)).sum() / weight.sum()
     assert float(metrics["critic_loss"]) == pytest.approx(float(expected), rel=1e-4)
