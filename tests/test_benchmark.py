@@ -96,6 +96,7 @@ def test_bytes_of_a_small_replay():
     assert scaling.num_bytes(state) == expected
 
 
+@pytest.mark.slow
 def test_seeds_are_trained_in_one_program():
     config = Config.from_preset("cpu", **TINY)
     results = scaling.by_seeds(Clock(), config, sizes=(1, 2))
