@@ -135,6 +135,7 @@ def test_evaluation_is_each_members_own(together: Trained, hopper: Config) -> No
         np.testing.assert_allclose(result.returns[index], own.returns, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_members_with_a_cache_and_a_table_of_episodes() -> None:
     config = point_config(
         acting_context="episode", window="scattered", return_conditioning="hindsight",

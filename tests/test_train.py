@@ -138,6 +138,7 @@ def test_updates_per_env_step(num_envs, utd, updates):
     assert config.env_steps_per_chunk == 400
 
 
+@pytest.mark.slow
 def test_every_option_runs():
     """Hindsight, dropout, normalization, fixed temperature, LayerNorm: together, finite."""
     config = point_config(
