@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import jax
 
-from sacformer_jax.collecting import collect_episodes
+from sacformer_jax.collecting import make_collector
 from sacformer_jax.config import ConfigError
 from sacformer_jax.datasets import check_dataset_id, write_episodes
 from sacformer_jax.evaluate import make_evaluator
@@ -101,11 +101,10 @@ def collect(
             return Acted(env.random_action(key), context)
         return agent.act(loaded.state, context, key, explore=actions == "sample")
 
+    collect_turn = make_collector(env, choose, context_length, agent.init_cache(env.num_envs))
     key, found = jax.random.key(seed), []
-    cache = agent.init_cache(env.num_envs)
     for turn in range(-(-episodes // env.num_envs)):
-        turn_key = jax.random.fold_in(key, turn)
-        found += collect_episodes(env, choose, context_length, cache, turn_key)
+        found += collect_turn(jax.random.fold_in(key, turn))
     who = "random actions" if actions == "random" else f"{loaded.config.agent}, {actions} actions"
     return write_episodes(
         found[:episodes], to, env.spec, who, f"{who} in {env.spec.name}, engine {env.spec.engine}"

@@ -30,20 +30,18 @@ class _Seen:
     step: VectorStep
 
 
-def collect_episodes(
-    env: VectorEnv, choose: Choose, context_length: int, cache: Any, key: jax.Array
-) -> list[Episode]:
-    """An episode of each of the N environments.
+def make_collector(
+    env: VectorEnv, choose: Choose, context_length: int, cache: Any
+) -> Callable[[jax.Array], list[Episode]]:
+    """``collect(key) -> N episodes``, one of each environment, by the key of resets and acting.
+
+    Those that bad physics ended are left out. Compiled once.
 
     Args:
       env: the environments.
       choose: how to act.
       context_length: K.
       cache: of contexts at the start of their episodes, ``agent.init_cache(N)``.
-      key: typed PRNG key, of the resets and of acting.
-
-    Returns:
-      N episodes, without those that bad physics ended.
     """
 
     def step(carry: Any, act_key: jax.Array) -> tuple[Any, _Seen]:
@@ -61,9 +59,12 @@ def collect_episodes(
         seen: _Seen = jax.lax.scan(step, (env_state, context), keys)[1]
         return seen  # [T, N, ...]
 
-    seen = jax.device_get(scan(key))
-    each = [_episode(jax.tree.map(lambda leaf, i=i: leaf[:, i], seen)) for i in range(env.num_envs)]
-    return [episode for episode in each if episode is not None]
+    def collect(key: jax.Array) -> list[Episode]:
+        seen = jax.device_get(scan(key))
+        columns = (jax.tree.map(lambda leaf, i=i: leaf[:, i], seen) for i in range(env.num_envs))
+        return [episode for column in columns if (episode := _episode(column)) is not None]
+
+    return collect
 
 
 def _episode(seen: _Seen) -> Episode | None:

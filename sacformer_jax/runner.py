@@ -74,7 +74,7 @@ def train(
     members = seed_members(config.all_seeds) if members is None else members
     population = make_population(config, members, devices or Devices.for_members(len(members)))
     check_memory(population)
-    dataset_of(population)  # what is wrong with it is said before anything is written
+    episodes = dataset_of(population)
     if config.run.video_every and is_first():
         check_drawable(population.program.env.env)
     folder = RunFolder(new_run_path(config))
@@ -84,7 +84,7 @@ def train(
         if is_first():
             folder.create(config, sources, population.program.env.spec, population.members)
         all_here()
-        return _start(population, folder, quiet, callbacks)
+        return _start(population, folder, quiet, callbacks, episodes)
 
     return _alone_in(folder, begin)
 
@@ -130,7 +130,7 @@ def resume(
 
     def go_on() -> RunResult:
         if folder.latest_step() is None:
-            return _start(population, folder, quiet, callbacks)
+            return _start(population, folder, quiet, callbacks, dataset_of(population))
         with Reporter(quiet or not is_first()) as reporter:
             restored = folder.restore(
                 population.stored(population.abstract()),
@@ -208,9 +208,14 @@ def _alone_in(folder: RunFolder, do: Callable[[], RunResult]) -> RunResult:
 
 
 def _start(
-    population: Population, folder: RunFolder, quiet: bool, callbacks: Sequence[Callback]
+    population: Population,
+    folder: RunFolder,
+    quiet: bool,
+    callbacks: Sequence[Callback],
+    episodes: Sequence[Episode],
 ) -> RunResult:
-    config, episodes = population.config, dataset_of(population)
+    """Trains from the start, the replay holding ``episodes``."""
+    config = population.config
     with Reporter(quiet or not is_first()) as reporter:
         # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
         # then compile to the same programs, and resuming finds them in the compilation cache.

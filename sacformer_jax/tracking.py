@@ -17,7 +17,6 @@ from typing import Any, Literal
 from sacformer_jax.callbacks import Callback, Event, RunStart
 from sacformer_jax.config import ConfigError
 from sacformer_jax.logging import Record
-from sacformer_jax.members import Member
 from sacformer_jax.results import RunResult
 
 WandbMode = Literal["online", "offline"]
@@ -103,7 +102,7 @@ class WandbTracker(Callback):
                     reinit="create_new",  # members run side by side
                     name=f"{run.path.name}-{member.name}" if len(ids) > 1 else run.path.name,
                     group=run.path.name,
-                    config=member_settings(run, member),
+                    config=member.config(run.config).flat(),
                     settings=settings,
                 )
             except self._wandb.errors.Error as error:
@@ -171,11 +170,6 @@ def resumed_tracking(path: Path) -> list[Callback]:
         return []
     known = json.loads(file.read_text())
     return Tracking(known["project"], known["entity"], known["mode"]).callbacks()
-
-
-def member_settings(run: RunStart, member: Member) -> dict[str, Any]:
-    """Every setting of a member, by name."""
-    return member.config(run.config).flat()
 
 
 def _named(kind: str, record: Record) -> Record:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -14,20 +13,18 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium import spaces
+from run_states import state_digest
 from trees import unequal
 
 from sacformer_jax import (
     Config,
     ConfigError,
     evaluate,
-    make_population,
     make_program,
     resume,
     train,
 )
-from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cli import main
-from sacformer_jax.digests import digest
 from sacformer_jax.envs import VectorEnv, gym_live, make_env
 from sacformer_jax.envs.gym_live import LiveEnvs
 from sacformer_jax.envs.native_host import STATE_SPEC
@@ -373,16 +370,6 @@ def test_a_train_state_goes_on_the_same_where_nothing_is_alive():
     assert host.replayed - before == 2 * (100 % 70)
 
 
-def _state_digest(path: Path) -> str:
-    folder = RunFolder(path)
-    run = folder.read_config()
-    population = make_population(run.config, run.members)
-    restored = folder.restore(
-        population.abstract(), population.block_axes, population.shardings, move_aside=False
-    )
-    return digest(restored.state, population.block_axes)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["sac", "sacformer"])
 def test_resuming_equals_never_having_stopped(agent, tmp_path):
@@ -395,7 +382,7 @@ def test_resuming_equals_never_having_stopped(agent, tmp_path):
     resume(paths[1], quiet=True)
     # Each of 2 environments of 2 seeds had taken 200 steps by the checkpoint.
     assert host.replayed - before == 4 * (200 % 70)
-    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert state_digest(paths[0]) == state_digest(paths[1])
     for name in ("seed-0", "seed-1"):
         metrics = [(path / name / "metrics.jsonl").read_bytes() for path in paths]
         assert metrics[0] == metrics[1]

@@ -24,7 +24,7 @@ from sacformer_jax import (
     train,
 )
 from sacformer_jax.buffer import TrajectoryBuffer
-from sacformer_jax.collecting import collect_episodes
+from sacformer_jax.collecting import make_collector
 from sacformer_jax.datasets import read_episodes
 from sacformer_jax.digests import digest
 from sacformer_jax.distributions import NoisyPoint, TanhGaussian
@@ -175,7 +175,7 @@ def _expert(context: Context, key: jax.Array) -> Acted:
 
 def _expert_episodes(num: int) -> list[Episode]:
     env = VectorEnv(PointEnv(), num)
-    return collect_episodes(env, _expert, 1, {}, jax.random.key(5))
+    return make_collector(env, _expert, 1, {})(jax.random.key(5))
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +290,7 @@ def test_a_dataset_is_read_as_it_was_collected(run: Path, dataset: Path) -> None
         return Acted(env.random_action(key), context)
 
     key = jax.random.fold_in(jax.random.key(3), 0)
-    expected = collect_episodes(env, random_action, 1, {}, key)
+    expected = make_collector(env, random_action, 1, {})(key)
     assert len(expected) == 16
     for name in ("test/random-v0", str(dataset), str(dataset / "data" / "main_data.hdf5")):
         episodes = read_episodes(name)

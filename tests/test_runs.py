@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_states import state_digest
 
 import sacformer_jax.logging as metric_logging
 from sacformer_jax import (
@@ -26,12 +27,10 @@ from sacformer_jax import (
     agents,
     evaluate,
     load_policy,
-    make_population,
     resume,
     runner,
     train,
 )
-from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
@@ -101,17 +100,6 @@ def _contents(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-def _state_digest(path: Path) -> str:
-    """Digest of the whole train state of the newest checkpoint."""
-    folder = RunFolder(path)
-    run = folder.read_config()
-    population = make_population(run.config, run.members)
-    restored = folder.restore(
-        population.abstract(), population.block_axes, population.shardings, move_aside=False
-    )
-    return digest(restored.state, population.block_axes)
-
-
 # --- resuming ----------------------------------------------------------------------------------
 
 
@@ -119,7 +107,7 @@ def test_resuming_equals_never_having_stopped(straight: Outcome, resumed: Outcom
     assert f"resuming at  {STOP} env steps" in resumed.printed
     assert resumed.result.env_steps == straight.result.env_steps == TOTAL
     paths = straight.result.path, resumed.result.path
-    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert state_digest(paths[0]) == state_digest(paths[1])
     assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
     best = [load_policy(path, "best").state for path in paths]
     assert digest(best[0]) == digest(best[1])
@@ -137,7 +125,7 @@ def test_resuming_keeps_the_cache_and_the_table_of_episodes(tmp_path: Path) -> N
     shutil.copytree(*paths)
     shutil.rmtree(paths[1] / "checkpoints" / "400")
     resume(paths[1], quiet=True)
-    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert state_digest(paths[0]) == state_digest(paths[1])
     assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
     policy = load_policy(paths[0], "latest")
     assert {x.shape for x in jax.tree.leaves(policy.agent.init_cache(1))} == {(1, 1, 100, 8)}
@@ -165,7 +153,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_from_the_beginning(
     (path / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 200}\n{"kind": "tr')
     shutil.copytree(straight.result.path / "best", path / "best")
     assert resume(path, quiet=True).evaluations == straight.result.evaluations
-    assert _state_digest(path) == _state_digest(straight.result.path)
+    assert state_digest(path) == state_digest(straight.result.path)
     assert (path / "metrics.jsonl").read_bytes() == (
         straight.result.path / "metrics.jsonl"
     ).read_bytes()

@@ -13,7 +13,8 @@ import numpy as np
 import optax
 import pytest
 from probe import PointEnv, point_config, point_env
-from test_runs import TINY, _state_digest
+from run_states import state_digest
+from test_runs import TINY
 from test_sac_update import make_window as make_sac_window
 from test_train import LEARNT
 from trees import largest_difference, unequal
@@ -597,5 +598,5 @@ def test_resuming_equals_never_having_stopped(tmp_path: Path) -> None:
     shutil.copytree(*paths)
     shutil.rmtree(paths[1] / "checkpoints" / "500")
     resume(paths[1], quiet=True)
-    assert _state_digest(paths[0]) == _state_digest(paths[1])
+    assert state_digest(paths[0]) == state_digest(paths[1])
     assert (paths[0] / "metrics.jsonl").read_bytes() == (paths[1] / "metrics.jsonl").read_bytes()
