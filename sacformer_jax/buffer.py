@@ -4,6 +4,8 @@ Each observation is stored once: the successor of a step is the next ring entry.
 by a uniformly random stored step (the anchor) and a uniformly random place for it among the K
 slots, so windows overhang both ends of an episode. A window with ``n`` steps in it can then be
 drawn through ``n`` anchors; its weight 1/n makes the expected weight of all stored steps equal.
+With a burn-in, steps before those K come with them, to be looked at but not learnt from (R2D2,
+Kapturowski et al. 2019); the anchor is never one of them.
 
 Scattered windows, as the authors' program draws them, are K different steps of one finished
 episode, in order; episodes are drawn uniformly, so steps of short ones more often.
@@ -40,6 +42,7 @@ class TrajectoryBuffer:
       hindsight: whether windows carry hindsight return-to-go; then only steps of finished
         episodes are drawn.
       scattered: whether windows are scattered instead of contiguous.
+      burn_in: steps of a contiguous window before the K that are learnt from.
 
     Raises:
       ConfigError: a column is shorter than :func:`shortest_column`.
@@ -53,9 +56,15 @@ class TrajectoryBuffer:
     max_episode_steps: int
     hindsight: bool = False
     scattered: bool = False
+    burn_in: int = 0
+
+    @property
+    def window_length(self) -> int:
+        """Steps of a window, those of the burn-in included."""
+        return self.burn_in + self.context_length
 
     def __post_init__(self) -> None:
-        needed = shortest_column(self.max_episode_steps, self.context_length, self.scattered)
+        needed = shortest_column(self.max_episode_steps, self.window_length, self.scattered)
         if self.length < needed:
             raise ConfigError(
                 f"buffer_capacity={self.length * self.num_envs} over num_envs={self.num_envs} "
@@ -142,7 +151,7 @@ class TrajectoryBuffer:
 
             return _in_turns(scattered, (episode, places))
         column, anchor = episodes.draw_entries(self.eligible(state), anchor_key, batch_size)
-        slot = jax.random.randint(slot_key, (batch_size,), 0, self.context_length)
+        slot = jax.random.randint(slot_key, (batch_size,), self.burn_in, self.window_length)
 
         def contiguous(which: tuple[jax.Array, jax.Array, jax.Array]) -> Window:
             return self.window(state, *which, rtg_discount)
@@ -158,7 +167,7 @@ class TrajectoryBuffer:
         rtg_discount: jax.Array,
     ) -> Window:
         """The windows with the ``anchor``-th oldest step of ``column`` at ``slot`` (``[B]``)."""
-        steps, k = state.steps, self.context_length
+        steps, k = state.steps, self.window_length
         rows = column[:, None]
 
         def places(num: int) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -175,7 +184,9 @@ class TrajectoryBuffer:
         same_episode = inside & (time_step == anchor_time + distance)
         step_position = position[:, :k]
         real_step = same_episode[:, :k]
-        mask = real_step & ~steps.bad[rows, step_position]
+        good = real_step & ~steps.bad[rows, step_position]
+        learnt = jnp.arange(k) >= self.burn_in
+        mask = good & learnt
         terminated = steps.terminated[rows, step_position]
         if self.hindsight:
             position_on, inside_on, distance_on = places(k + self.max_episode_steps)
@@ -186,7 +197,7 @@ class TrajectoryBuffer:
             return_to_go = jnp.zeros(position.shape)
         return Window(
             obs=jnp.where(same_episode[..., None], steps.obs[rows, position], 0.0),
-            action=jnp.where(mask[..., None], steps.action[rows, step_position], 0.0),
+            action=jnp.where(good[..., None], steps.action[rows, step_position], 0.0),
             reward=jnp.where(mask, steps.reward[rows, step_position], 0.0),
             discount=1.0 - terminated.astype(jnp.float32),
             return_so_far=jnp.where(same_episode, steps.return_so_far[rows, position], 0.0),
@@ -195,7 +206,7 @@ class TrajectoryBuffer:
             state_mask=same_episode,
             mask=mask,
             bootstrap_mask=mask & (terminated | same_episode[:, 1:]),
-            weight=1.0 / jnp.sum(real_step, axis=1),
+            weight=1.0 / jnp.sum(real_step & learnt, axis=1),
         )
 
     def scattered_window(

@@ -111,6 +111,9 @@ class ContextConfig:
 
     context_length: int = 6
     """K: (return-to-go, state) pairs the actor sees, in training and in acting on the window."""
+    burn_in: int = 0
+    """Steps before those K of a window that are looked at but not learnt from, so that learning sees
+    as much of the past as acting does; K - 1 for all of it."""
     acting_context: ActingContext = "window"
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
     acting_context_limit: int | None = None
@@ -134,6 +137,11 @@ class ContextConfig:
     normalize_obs: bool = False
     """Normalize observations by their running mean and variance."""
 
+    @property
+    def window_length(self) -> int:
+        """Steps of a window that is drawn from the replay."""
+        return self.burn_in + self.context_length
+
 
 @dataclasses.dataclass(frozen=True)
 class ActorConfig:
@@ -153,6 +161,9 @@ class ActorConfig:
     """Leave dropout on in acting and in evaluation (sacformer)."""
     actor_activation: Activation = "relu"
     """Activation function."""
+    state_path_width: int = 0
+    """Width of an MLP of two layers from the newest state to the heads, around the transformer, whose
+    part starts at zero; 0: none (sacformer)."""
     head_init_scale: float = 1.0
     """Gain of the heads' initialization: Xavier-uniform, of ppo's mean orthogonal."""
 
@@ -179,6 +190,8 @@ class CriticConfig:
     """Hidden layers (mlp) or transformer blocks (transformer)."""
     critic_width: int = 256
     """Width of hidden layers (mlp) or tokens (transformer)."""
+    critic_history: int = 1
+    """States that a critic sees, the newest included, with the actions between them (mlp)."""
     critic_heads: int = 1
     """Attention heads (transformer)."""
     critic_activation: Activation = "relu"
@@ -207,6 +220,8 @@ class LearningConfig:
     """Adam step size of the critics."""
     discount: float = 0.99
     """Discount factor γ."""
+    td_lambda: float = 0.0
+    """λ of the critics' targets along a window: 0 for one step, towards 1 for all that follow."""
     tau: float = 0.005
     """Soft-update coefficient of the target critics."""
     alpha: float = 0.2
@@ -406,9 +421,9 @@ def field_places() -> dict[str, tuple[str, Any]]:
     return places
 
 
-def shortest_column(max_episode_steps: int, context_length: int, scattered: bool) -> int:
+def shortest_column(max_episode_steps: int, window_length: int, scattered: bool) -> int:
     """Steps that each environment's column must hold: the longest episode and a window.
 
     For scattered windows two of the longest episodes, so that one is whole at any time.
     """
-    return max_episode_steps + (max_episode_steps if scattered else context_length)
+    return max_episode_steps + (max_episode_steps if scattered else window_length)

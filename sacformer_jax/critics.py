@@ -34,9 +34,9 @@ class CriticInputs:
       obs: ``[B, K, O]`` normalized, at the steps.
       next_obs: ``[B, K, O]`` normalized, after them.
       action: ``[B, K, A]``, as replayed.
-      time_step: int32 ``[B, K+1]``; like ``state_mask`` looked at by the transformer alone, whose
-        windows are contiguous.
-      state_mask: bool ``[B, K+1]``.
+      time_step: int32 ``[B, K+1]``; looked at by the transformer alone.
+      state_mask: bool ``[B, K+1]``; looked at by those that see the past, whose windows are
+        contiguous.
     """
 
     obs: jax.Array
@@ -66,7 +66,12 @@ class Critics:
 
 
 def make_critics(
-    config: CriticConfig, dtype: str, context_length: int, max_time_step: int, num: int = 2
+    config: CriticConfig,
+    dtype: str,
+    context_length: int,
+    max_time_step: int,
+    num: int = 2,
+    burn_in: int = 0,
 ) -> Critics:
     """The critics that a configuration asks for.
 
@@ -76,6 +81,7 @@ def make_critics(
       context_length: K; no candidate attends to more than K states.
       max_time_step: size of the transformer's time-step embedding.
       num: C.
+      burn_in: first steps of a window of which nobody asks what they are worth.
     """
     if config.critic == "mlp":
         widths = (config.critic_width,) * config.critic_layers
@@ -86,6 +92,8 @@ def make_critics(
             dtype,
             config.critic_init,
             num,
+            config.critic_history,
+            burn_in,
         )
     trunk = TransformerConfig(
         layers=config.critic_layers,
@@ -137,15 +145,63 @@ def mlp_critics(
     dtype: str = "float32",
     kernel_init: str = "lecun",
     num: int = 2,
+    history: int = 1,
+    burn_in: int = 0,
 ) -> Critics:
-    """Critics that see the state and the action alone (the paper's)."""
+    """Critics that see the state and the action alone (the paper's), or the last states.
+
+    Args:
+      widths: of the hidden layers.
+      activation: one of :data:`~sacformer_jax.transformer.ACTIVATIONS`.
+      layer_norm: LayerNorm before each activation.
+      dtype: of the products.
+      kernel_init: one of :data:`~sacformer_jax.networks.KERNEL_INITS`.
+      num: C.
+      history: how many states they see, with the actions between them; see :func:`with_history`.
+      burn_in: first steps of a window that are not judged: Q is 0 there.
+    """
     critic = twin(MLPCritic, num)(tuple(widths), activation, layer_norm, dtype, kernel_init)
     apply: Callable[..., jax.Array] = critic.apply  # type: ignore[assignment]
+
+    def judge(params: Params, seen: jax.Array, candidate: jax.Array) -> jax.Array:
+        q = apply(params, seen[:, burn_in:], candidate[:, burn_in:])
+        return jnp.pad(q, ((0, 0), (0, 0), (burn_in, 0)))
+
+    def seen_now(inputs: CriticInputs) -> jax.Array:
+        return inputs.obs if history == 1 else with_history(inputs, history)[:, :-1]
+
+    def seen_next(inputs: CriticInputs) -> jax.Array:
+        return inputs.next_obs if history == 1 else with_history(inputs, history)[:, 1:]
+
     return Critics(
-        init=lambda key, inputs: critic.init(key, inputs.obs, inputs.action),
-        now=lambda params, inputs, candidate: apply(params, inputs.obs, candidate),
-        following=lambda params, inputs, candidate: apply(params, inputs.next_obs, candidate),
+        init=lambda key, inputs: critic.init(key, seen_now(inputs), inputs.action),
+        now=lambda params, inputs, candidate: judge(params, seen_now(inputs), candidate),
+        following=lambda params, inputs, candidate: judge(params, seen_next(inputs), candidate),
     )
+
+
+def with_history(inputs: CriticInputs, num: int) -> jax.Array:
+    """Each state with the ones before it and the actions that led on from those.
+
+    Args:
+      inputs: of a contiguous window.
+      num: n, how many states, the newest included.
+
+    Returns:
+      ``[B, K+1, n O + (n-1) A]``: the newest state, then, step by step further back, state and
+      action; zeros for what lies before the window or the episode.
+    """
+    states = jnp.concatenate([inputs.obs, inputs.next_obs[:, -1:]], axis=1)  # [B, K+1, O]
+    # An action that is known at a state; the last one has none.
+    action = jnp.pad(inputs.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
+    pairs = jnp.concatenate([states, action], axis=-1)
+    pairs = jnp.where(inputs.state_mask[..., None], pairs, 0.0)
+    length = states.shape[1]
+    earlier = [
+        jnp.pad(pairs, ((0, 0), (back, 0), (0, 0)))[:, :length] for back in range(1, num)
+    ]
+    return jnp.concatenate([states, *earlier], axis=-1)
+
 
 
 class TransformerCritic(nn.Module):

@@ -63,7 +63,7 @@ def _advice(config: Config, room: int) -> str:
     num_envs, context = config.task.num_envs, config.context
     scattered = context.window == "scattered"
     least = num_envs * shortest_column(
-        config.task.max_episode_steps, context.context_length, scattered
+        config.task.max_episode_steps, context.window_length, scattered
     )
     largest = room // num_envs * num_envs
     if largest >= least:

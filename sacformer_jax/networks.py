@@ -123,6 +123,9 @@ class TransformerActor(nn.Module):
       context_length: K; no position attends to more than K pairs.
       max_time_step: size of the time-step embedding.
       head_init_scale: see :class:`GaussianHeads`.
+      state_path: widths of an MLP on the state alone, whose features go to the heads, those of the
+        trunk added to them by a layer that starts at zero: the policy starts as SAC's, and learns
+        what the past has to add (a residual path around the trunk). None: the trunk alone.
       cached: act on an episode step by step: keys and values of the K newest steps are kept in
         the collection ``"cache"`` (which must be mutable) instead of being computed again.
     """
@@ -133,6 +136,7 @@ class TransformerActor(nn.Module):
     max_time_step: int
     head_init_scale: float
     tokens: Tokens = "gs"
+    state_path: Sequence[int] | None = None
     cached: bool = False
 
     @nn.compact
@@ -171,6 +175,12 @@ class TransformerActor(nn.Module):
             features, seen = self._newest_features(step, time_step, deterministic)
         else:
             features, seen = self._features(step, time_step, state_mask, deterministic, past)
+        if self.state_path is not None:
+            newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
+            activation, dtype = self.config.activation, self.config.dtype
+            by_state = MLP(self.state_path, activation, dtype=dtype, name="state_path")(newest)
+            zeros = nn.initializers.zeros
+            features = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(features)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(features), seen)
 

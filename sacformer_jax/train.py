@@ -161,6 +161,7 @@ def _learning(config: Config, env: VectorEnv, agent: Agent) -> ReplayLearning | 
         obs_size=env.spec.obs_size,
         action_size=env.spec.action_size,
         context_length=config.context.context_length,
+        burn_in=config.context.burn_in,
         max_episode_steps=env.max_episode_steps,
         hindsight=config.context.return_conditioning == "hindsight",
         scattered=config.context.window == "scattered",

@@ -78,7 +78,7 @@ class States:
 
 @flax.struct.dataclass
 class Window:
-    """A batch of K steps of one episode each.
+    """A batch of K steps of one episode each, those of a burn-in included.
 
     Contiguous steps come with the K+1 states around them. Scattered steps (``following`` is there)
     come with their own K states, ``[B, K]`` instead of ``[B, K+1]`` below, and those that followed.
@@ -93,9 +93,9 @@ class Window:
         ``rtg_discount``; zero unless asked for (hindsight).
       time_step: int32 ``[B, K+1]``.
       state_mask: bool ``[B, K+1]`` whether the state belongs to the window's episode.
-      mask: bool ``[B, K]`` a real step, for the actor loss.
+      mask: bool ``[B, K]`` a real step that is to be learnt from, for the actor loss.
       bootstrap_mask: bool ``[B, K]`` its successor is known, or it terminated: for the critic loss.
-      weight: ``[B]`` one over the number of steps in the window: makes the expected weight of
+      weight: ``[B]`` one over the number of real steps after the burn-in: makes the expected weight of
         every stored step the same although windows at the ends of episodes are short. For
         scattered windows 1.
       following: the states that followed the steps of a scattered window; None where contiguous.

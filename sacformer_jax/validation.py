@@ -10,14 +10,14 @@ _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width", "critic_heads", "policy_delay", "rollout_steps", "epochs", "minibatches",
+    "critic_width", "critic_heads", "critic_history", "policy_delay", "rollout_steps", "epochs", "minibatches",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
     "critic_learning_rate", "alpha", "alpha_learning_rate", "tau", "action_noise_clip",
     "clip_range", "max_grad_norm", "target_noise_clip",
 )  # fmt: skip
-_AT_MOST_ONE = ("tau", "discount", "rtg_discount", "gae_lambda")
+_AT_MOST_ONE = ("tau", "discount", "rtg_discount", "gae_lambda", "td_lambda")
 
 
 def _require(holds: bool, message: str) -> None:
@@ -45,13 +45,15 @@ def check(config: Config) -> None:
     for name in (
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
         "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
-        "value_coefficient", "pretrain_updates", "video_every",
+        "value_coefficient", "pretrain_updates", "video_every", "burn_in", "state_path_width",
+        "td_lambda",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _check_seeds(config)
     _check_actor(config)
     _check_policy(config)
     _check_window(config)
+    _check_past(config)
     _check_target_return(config)
     _check_acting(config)
     _check_critic(config)
@@ -87,6 +89,11 @@ def _check_actor(config: Config) -> None:
     )
     if config.agent in MLP_AGENTS:
         _require(
+            actor.state_path_width == 0,
+            f"state_path_width={actor.state_path_width}: agent={config.agent} has no transformer "
+            "to go around; use state_path_width=0, or agent=sacformer",
+        )
+        _require(
             context.context_length == 1,
             f"context_length={context.context_length}: agent={config.agent} sees one state; "
             "use context_length=1, or agent=sacformer",
@@ -118,6 +125,38 @@ def _check_policy(config: Config) -> None:
         config.policy.policy == "gaussian" or not config.learning.tune_alpha,
         "tune_alpha=True: policy=deterministic has no entropy to tune it by; use "
         "tune_alpha=False, or policy=gaussian",
+    )
+
+
+def _check_past(config: Config) -> None:
+    """What looks back over a window needs one whose steps follow each other, long enough."""
+    context, critic, td_lambda = config.context, config.critic, config.learning.td_lambda
+    asked = {
+        f"burn_in={context.burn_in}": context.burn_in > 0,
+        f"critic_history={critic.critic_history}": critic.critic_history > 1,
+        f"td_lambda={td_lambda}": td_lambda > 0,
+    }
+    for what, is_asked in asked.items():
+        off = f"{what.split('=')[0]}={1 if 'history' in what else 0}"
+        _require(
+            not is_asked or config.agent not in MLP_AGENTS,
+            f"{what}: agent={config.agent} learns from single steps; use {off}, or agent=sacformer",
+        )
+        _require(
+            not is_asked or context.window == "contiguous",
+            f"{what}: steps of window=scattered do not follow each other; use {off}, or "
+            "window=contiguous",
+        )
+    _require(
+        critic.critic_history == 1 or critic.critic == "mlp",
+        f"critic_history={critic.critic_history}: is for critic=mlp; a transformer sees the whole "
+        "window; use critic_history=1",
+    )
+    _require(
+        critic.critic_history <= context.window_length + 1,
+        f"critic_history={critic.critic_history}: a window has {context.window_length + 1} states "
+        f"(burn_in={context.burn_in}, context_length={context.context_length} and one after "
+        "them); use as many or fewer",
     )
 
 
@@ -324,7 +363,7 @@ def _check_steps(config: Config) -> None:
     )
     scattered = config.context.window == "scattered"
     least = task.num_envs * shortest_column(
-        task.max_episode_steps, config.context.context_length, scattered
+        task.max_episode_steps, config.context.window_length, scattered
     )
     what = "two of the longest episodes" if scattered else "the longest episode and a window"
     _require(

@@ -50,6 +50,7 @@ class SACParts(OffPolicyParts):
       acting_dropout: dropout is on in acting, too.
       tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
       initial_alpha: α at the start.
+      td_lambda: λ of the critics' targets along a window.
     """
 
     acting_actor: nn.Module
@@ -59,6 +60,7 @@ class SACParts(OffPolicyParts):
     acting_dropout: bool
     tune_alpha: bool
     initial_alpha: float
+    td_lambda: float
 
 
 def sac_parts(
@@ -77,6 +79,7 @@ def sac_parts(
             config.precision.compute_dtype,
             config.context.context_length,
             max_time_step(spec),
+            burn_in=config.context.burn_in,
         ),
         distribution=_distribution(config, spec),
         obs_size=spec.obs_size,
@@ -87,6 +90,7 @@ def sac_parts(
         acting_dropout=config.actor.acting_dropout,
         tune_alpha=config.learning.tune_alpha,
         initial_alpha=config.learning.alpha,
+        td_lambda=config.learning.td_lambda,
         normalize_obs=config.context.normalize_obs,
         data=data,
     )

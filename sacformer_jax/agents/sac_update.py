@@ -52,6 +52,34 @@ def bellman_target(
     return reward + discount * (jnp.min(next_q, axis=0) - alpha * next_log_prob)
 
 
+def lambda_target(one_step: jax.Array, decay: jax.Array, next_value: jax.Array) -> jax.Array:
+    """Targets along a window: ``y_t = y1_t + decay_t (y_{t+1} - Q_{t+1})``.
+
+    With ``decay = γλ`` they are the λ-returns of Peng's Q(λ) (Kozuno et al., arXiv 2103.00107),
+    with SAC's entropy bonus: geometrically weighted means of the targets of one step, two, …, not
+    corrected for what the policy would do otherwise by now.
+
+    Args:
+      one_step: ``[B, K]``, :func:`bellman_target`.
+      decay: ``[B, K]``; 0 where the next step of the window does not follow, or cannot be judged.
+      next_value: ``[B, K]``, what ``one_step`` has of the critics: the least of them after the step.
+
+    Returns:
+      ``[B, K]``.
+    """
+
+    def backward(
+        later: jax.Array, step: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        own, factor, value = step
+        y = own + factor * (later - value)
+        return y, y
+
+    steps = jax.tree.map(lambda x: x.swapaxes(0, 1), (one_step, decay, next_value))  # [K, B]
+    nothing = jnp.zeros_like(one_step[:, 0])
+    return jax.lax.scan(backward, nothing, steps, reverse=True)[1].swapaxes(0, 1)  # [B, K]
+
+
 def make_sac_agent(parts: SACParts) -> Agent:
     """Binds the parts to the shared SAC functions."""
     return Agent(
@@ -216,6 +244,11 @@ def _update_critics(
         next_log_prob,
         _alpha(learner),
     )
+    if parts.td_lambda > 0.0:
+        # The last step of the window has no later target, nor has one before a step that has none.
+        follows = jnp.pad(window.bootstrap_mask[:, 1:], ((0, 0), (0, 1)))
+        decay = parts.td_lambda * hyper.discount * window.discount * follows
+        y = lambda_target(y, decay, jnp.min(next_q, axis=0))
 
     backup = Backup(policy=(gaussian, next_gaussian), next_q=next_q, y=y)
     learner, metrics, non_finite = step_critics(

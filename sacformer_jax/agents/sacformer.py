@@ -30,6 +30,7 @@ def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
         max_time_step=max_time_step(spec),
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
+        state_path=(settings.state_path_width,) * 2 if settings.state_path_width else None,
     )
 
 
