@@ -112,8 +112,8 @@ class ContextConfig:
     context_length: int = 6
     """K: (return-to-go, state) pairs the actor sees, in training and in acting on the window."""
     burn_in: int = 0
-    """Steps before those K of a window that are looked at but not learnt from, so that learning sees
-    as much of the past as acting does; K - 1 for all of it."""
+    """Steps before those K of a window that are looked at but not learnt from, so that learning
+    sees as much of the past as acting does; K - 1 for all of it."""
     acting_context: ActingContext = "window"
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
     acting_context_limit: int | None = None
@@ -162,8 +162,8 @@ class ActorConfig:
     actor_activation: Activation = "relu"
     """Activation function."""
     state_path_width: int = 0
-    """Width of an MLP of two layers from the newest state to the heads, around the transformer, whose
-    part starts at zero; 0: none (sacformer)."""
+    """Width of an MLP of two layers from the newest state to the heads, around the transformer,
+    whose part starts at zero; 0: none (sacformer)."""
     head_init_scale: float = 1.0
     """Gain of the heads' initialization: Xavier-uniform, of ppo's mean orthogonal."""
 

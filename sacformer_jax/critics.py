@@ -197,11 +197,8 @@ def with_history(inputs: CriticInputs, num: int) -> jax.Array:
     pairs = jnp.concatenate([states, action], axis=-1)
     pairs = jnp.where(inputs.state_mask[..., None], pairs, 0.0)
     length = states.shape[1]
-    earlier = [
-        jnp.pad(pairs, ((0, 0), (back, 0), (0, 0)))[:, :length] for back in range(1, num)
-    ]
+    earlier = [jnp.pad(pairs, ((0, 0), (back, 0), (0, 0)))[:, :length] for back in range(1, num)]
     return jnp.concatenate([states, *earlier], axis=-1)
-
 
 
 class TransformerCritic(nn.Module):

@@ -95,8 +95,8 @@ class Window:
       state_mask: bool ``[B, K+1]`` whether the state belongs to the window's episode.
       mask: bool ``[B, K]`` a real step that is to be learnt from, for the actor loss.
       bootstrap_mask: bool ``[B, K]`` its successor is known, or it terminated: for the critic loss.
-      weight: ``[B]`` one over the number of real steps after the burn-in: makes the expected weight of
-        every stored step the same although windows at the ends of episodes are short. For
+      weight: ``[B]`` one over the number of real steps after the burn-in: makes the expected weight
+        of every stored step the same although windows at the ends of episodes are short. For
         scattered windows 1.
       following: the states that followed the steps of a scattered window; None where contiguous.
     """

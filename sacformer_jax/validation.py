@@ -10,7 +10,8 @@ _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
-    "critic_width", "critic_heads", "critic_history", "policy_delay", "rollout_steps", "epochs", "minibatches",
+    "critic_width", "critic_heads", "critic_history", "policy_delay", "rollout_steps", "epochs",
+    "minibatches",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",

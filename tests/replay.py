@@ -85,7 +85,11 @@ def transitions(columns: list[list[Step]]) -> Transition:
 
 
 def make_buffer(
-    context_length: int, hindsight: bool, length: int = 25, scattered: bool = False
+    context_length: int,
+    hindsight: bool,
+    length: int = 25,
+    scattered: bool = False,
+    burn_in: int = 0,
 ) -> TrajectoryBuffer:
     return TrajectoryBuffer(
         num_envs=NUM_ENVS,
@@ -96,6 +100,7 @@ def make_buffer(
         max_episode_steps=MAX_EPISODE,
         hindsight=hindsight,
         scattered=scattered,
+        burn_in=burn_in,
     )
 
 

@@ -45,25 +45,31 @@ def every_window(
         (column, anchor, slot)
         for column, steps in enumerate(ring)
         for anchor in range(eligible(steps, buffer.hindsight))
-        for slot in range(buffer.context_length)
+        for slot in range(buffer.burn_in, buffer.burn_in + buffer.context_length)
     ]
     column, anchor, slot = (jnp.asarray(x) for x in zip(*places, strict=True))
     window = jax.jit(buffer.window)(filled(buffer, columns), column, anchor, slot, GAMMA)
     return places, jax.tree.map(np.asarray, window)
 
 
-CASES = list(itertools.product((1, 2, 5), (False, True), (17, 25, 61)))
+CASES = [
+    *itertools.product((1, 2, 5), (False, True), (17, 25, 61), (0,)),
+    (2, False, 61, 1),
+    (3, True, 25, 4),
+]
+CASE = ("context_length", "hindsight", "num_steps", "burn_in")
 
 
-@pytest.mark.parametrize(("context_length", "hindsight", "num_steps"), CASES)
-def test_every_window_against_the_oracle(context_length, hindsight, num_steps):
-    buffer = make_buffer(context_length, hindsight)
+@pytest.mark.parametrize(CASE, CASES)
+def test_every_window_against_the_oracle(context_length, hindsight, num_steps, burn_in):
+    buffer = make_buffer(context_length, hindsight, burn_in=burn_in)
+    length = burn_in + context_length
     columns = simulate(num_steps, num_steps)
     ring = stored(columns, buffer.length)
     places, window = every_window(buffer, columns)
     for b, (column, anchor, slot) in enumerate(places):
         steps = ring[column]
-        indices = [anchor - slot + i for i in range(context_length + 1)]
+        indices = [anchor - slot + i for i in range(length + 1)]
         real = [0 <= i < len(steps) and steps[i].episode == steps[anchor].episode for i in indices]
         for i, (index, is_real) in enumerate(zip(indices, real, strict=True)):
             assert window.state_mask[b, i] == is_real
@@ -76,29 +82,33 @@ def test_every_window_against_the_oracle(context_length, hindsight, num_steps):
             assert window.return_so_far[b, i] == pytest.approx(step.return_so_far, abs=1e-6)
             expected = oracle_return_to_go(steps, index) if hindsight else 0.0
             assert window.return_to_go[b, i] == pytest.approx(expected, abs=1e-5)
-            if i == context_length:
+            if i == length:
                 continue
-            assert window.mask[b, i] == (not step.bad)
+            learnt = not step.bad and i >= burn_in
+            assert window.mask[b, i] == learnt
             knows_next = step.terminated or real[i + 1]
-            assert window.bootstrap_mask[b, i] == (knows_next and not step.bad)
+            assert window.bootstrap_mask[b, i] == (knows_next and learnt)
             if not step.bad:
                 assert window.action[b, i, 0] == step.number + 0.5
+            if learnt:
                 assert window.reward[b, i] == np.float32(step.reward)
                 assert window.discount[b, i] == 1.0 - step.terminated
-        num_real = sum(real[:context_length])
+        num_real = sum(real[burn_in:length])
         assert window.weight[b] == pytest.approx(1.0 / num_real)
         assert not window.mask[b][~window.state_mask[b, :-1]].any()
 
 
-@pytest.mark.parametrize(("context_length", "hindsight", "num_steps"), CASES)
-def test_every_stored_step_has_the_same_expected_weight(context_length, hindsight, num_steps):
-    buffer = make_buffer(context_length, hindsight)
+@pytest.mark.parametrize(CASE, CASES)
+def test_every_stored_step_has_the_same_expected_weight(
+    context_length, hindsight, num_steps, burn_in
+):
+    buffer = make_buffer(context_length, hindsight, burn_in=burn_in)
     columns = simulate(num_steps + 100, num_steps)
     places, window = every_window(buffer, columns)
     actor: dict[int, float] = {}
     critic: dict[int, float] = {}
     for b in range(len(places)):
-        for i in range(context_length):
+        for i in range(burn_in + context_length):
             number = int(window.obs[b, i, 0])
             share = float(window.weight[b]) / len(places)  # places are equally likely
             if window.mask[b, i]:
@@ -189,3 +199,5 @@ def test_refuses_a_ring_shorter_than_an_episode_and_a_window():
     make_buffer(5, False, length=MAX_EPISODE + 5)
     with pytest.raises(ValueError, match=r"buffer_capacity=33 over num_envs=3 .*>= 36"):
         make_buffer(5, False, length=MAX_EPISODE + 4)
+    with pytest.raises(ValueError, match=r"buffer_capacity=36 over num_envs=3 .*>= 39"):
+        make_buffer(5, False, length=MAX_EPISODE + 5, burn_in=1)

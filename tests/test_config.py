@@ -386,6 +386,28 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"total_env_steps": 2**31}, f"total_env_steps={2**31}"),
     # (50 steps + K = 6) in each of two environments.
     ({"buffer_capacity": 111}, "at least 112"),
+    ({"buffer_capacity": 112, "burn_in": 1}, "at least 114"),
+    ({"burn_in": -1}, "burn_in=-1"),
+    ({"burn_in": 2, "window": "scattered", "prefill_env_steps": 100}, "window=contiguous"),
+    ({"td_lambda": 1.5}, "td_lambda=1.5"),
+    ({"td_lambda": -0.5}, "td_lambda=-0.5"),
+    ({"td_lambda": 0.5, "window": "scattered", "prefill_env_steps": 100}, "use td_lambda=0"),
+    ({"critic_history": 0}, "critic_history=0"),
+    ({"critic_history": 2, "critic": "transformer"}, "critic=mlp"),
+    ({"critic_history": 8}, "a window has 7 states"),
+    ({"state_path_width": -1}, "state_path_width=-1"),
+    *(
+        (
+            {**what, "agent": "sac", "context_length": 1, "return_conditioning": "none"},
+            "agent=sac",
+        )
+        for what in (
+            {"burn_in": 1},
+            {"critic_history": 2},
+            {"td_lambda": 0.5},
+            {"state_path_width": 8},
+        )
+    ),
     ({"updates_per_env_step": 0}, "updates_per_env_step=0.0"),
     ({"updates_per_env_step": math.inf}, "updates_per_env_step=inf"),
     ({"updates_per_env_step": 1e-5}, "simpler fraction"),

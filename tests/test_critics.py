@@ -17,6 +17,7 @@ from sacformer_jax.critics import (
     make_critics,
     mlp_critics,
     transformer_critics,
+    with_history,
 )
 from sacformer_jax.transformer import TransformerConfig
 
@@ -66,6 +67,36 @@ def test_mlp_critics_are_two_mlps():
             for layer in ("dense_0", "dense_1"):
                 x = np.maximum(dense(x, p["mlp"][layer]), 0.0)
             np.testing.assert_allclose(q[i], dense(x, p["q"])[..., 0], rtol=1e-4, atol=1e-5)
+
+
+def test_history_by_hand():
+    """States 10, 20, 30, 40 with the actions 1, 2, 3 between them; the first is of no episode."""
+    obs = jnp.array([[[10.0], [20.0], [30.0], [40.0]]])
+    inputs = CriticInputs(
+        obs=obs[:, :-1],
+        next_obs=obs[:, 1:],
+        action=jnp.array([[[1.0], [2.0], [3.0]]]),
+        time_step=jnp.array([[0, 0, 1, 2]]),
+        state_mask=jnp.array([[False, True, True, True]]),
+    )
+    seen = with_history(inputs, 3)
+    assert seen[0, 1:].tolist() == [[20, 0, 0, 0, 0], [30, 20, 2, 0, 0], [40, 30, 3, 20, 2]]
+    np.testing.assert_array_equal(with_history(inputs, 1), obs)
+
+
+def test_critics_with_history_are_mlps_on_it_and_do_not_judge_the_burn_in():
+    inputs, candidate, burn_in = make_inputs(), make_candidate(), 2
+    critics = mlp_critics((8, 8), "relu", False, history=3, burn_in=burn_in)
+    params = randomized(jax.jit(critics.init)(jax.random.key(0), inputs))
+    plain = mlp_critics((8, 8), "relu", False)
+    seen = with_history(inputs, 3)
+    for judge, states in ((critics.now, seen[:, :-1]), (critics.following, seen[:, 1:])):
+        q = jax.jit(judge)(params, inputs, candidate)
+        # The same MLP on what is seen, as if that were the observation.
+        expected = plain.now(params, dataclasses.replace(inputs, obs=states), candidate)
+        np.testing.assert_allclose(q[..., burn_in:], expected[..., burn_in:], rtol=1e-5, atol=1e-6)
+        assert q.shape == expected.shape
+        assert not q[..., :burn_in].any()
 
 
 # --- the transformer -----------------------------------------------------------------------------

@@ -16,9 +16,11 @@ from sacformer_jax.transformer import TransformerConfig, banded_causal_mask
 OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
 
 
-def make_actor(layers=3, width=16, heads=1, dropout=0.1, context_length=K, tokens="gs"):
+def make_actor(
+    layers=3, width=16, heads=1, dropout=0.1, context_length=K, tokens="gs", state_path=None
+):
     config = TransformerConfig(layers, width, heads, 4, dropout, "relu")
-    return TransformerActor(config, ACT, context_length, MAX_TIME, 1.0, tokens)
+    return TransformerActor(config, ACT, context_length, MAX_TIME, 1.0, tokens, state_path)
 
 
 def make_inputs(states=K, seed=0):
@@ -60,17 +62,28 @@ def oracle(params, inputs, layers, heads, band, tokens="gs"):
         for layer in range(layers):
             x = gpt2_block(x, params["trunk"][f"block_{layer}"], heads, allowed)
         x = layer_norm(x, params["trunk"]["ln_f"])[1::n]
+        if "state_path" in params:
+            by_state = inputs["obs"][b].astype(float)
+            for name in ("dense_0", "dense_1"):
+                by_state = np.maximum(dense(by_state, params["state_path"][name]), 0.0)
+            x = by_state + dense(x, params["from_trunk"])
         means.append(dense(x, params["heads"]["mean"]))
         log_stds.append(np.clip(dense(x, params["heads"]["log_std"]), -20.0, 2.0))
     return np.stack(means), np.stack(log_stds)
 
 
 @pytest.mark.parametrize(
-    ("layers", "heads", "states", "tokens"),
-    [(3, 1, K, "gs"), (2, 2, K, "gs"), (2, 4, K + 1, "gs"), (3, 1, K + 1, "gsa")],
+    ("layers", "heads", "states", "tokens", "state_path"),
+    [
+        (3, 1, K, "gs", None),
+        (2, 2, K, "gs", None),
+        (2, 4, K + 1, "gs", None),
+        (3, 1, K + 1, "gsa", None),
+        (1, 2, K, "gsa", (12, 10)),
+    ],
 )
-def test_actor_equals_the_numpy_decision_transformer(layers, heads, states, tokens):
-    actor = make_actor(layers=layers, heads=heads, tokens=tokens)
+def test_actor_equals_the_numpy_decision_transformer(layers, heads, states, tokens, state_path):
+    actor = make_actor(layers=layers, heads=heads, tokens=tokens, state_path=state_path)
     inputs = make_inputs(states)
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
     out = jax.jit(gaussian_of(actor))(params, **inputs)
@@ -219,3 +232,28 @@ def test_a_state_with_a_past_is_as_in_one_pass(tokens):
     for name in ("mean", "log_std"):
         parts = np.concatenate([getattr(before, name), getattr(after, name)], axis=1)
         np.testing.assert_allclose(parts, getattr(together, name), rtol=1e-5, atol=1e-5)
+
+
+def test_with_a_path_around_it_the_trunk_starts_with_nothing_to_say_and_learns():
+    actor = make_actor(layers=1, state_path=(12, 12))
+    inputs = make_inputs()
+    inputs["state_mask"][:] = True
+    params = jax.jit(actor.init)(jax.random.key(0), **inputs)
+    apply = jax.jit(gaussian_of(actor))
+    other_past = {name: np.array(value) for name, value in inputs.items()}
+    other_past["obs"][:, :-1] += 1.0
+    other_past["return_to_go"] += 1.0
+    other_past["time_step"][:] = 7
+    before = apply(params, **inputs)
+    np.testing.assert_array_equal(apply(params, **other_past).mean[:, -1], before.mean[:, -1])
+    assert not np.allclose(apply(params, **other_past).mean[:, 0], before.mean[:, 0])
+
+    def gradient(params):
+        return jax.jit(jax.grad(lambda p: apply(p, **inputs).mean.sum()))(params)["params"]
+
+    # At first only the layer from the trunk learns of its part, then the trunk does, too.
+    first = gradient(params)
+    assert np.any(first["from_trunk"]["kernel"])
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(first["trunk"]))
+    params["params"]["from_trunk"]["kernel"] += 0.1 * first["from_trunk"]["kernel"]
+    assert all(np.any(leaf) for leaf in jax.tree.leaves(gradient(params)["embed_state"]))

@@ -14,7 +14,12 @@ from gpt2 import gaussian_of
 from probe import point_config, point_env
 
 from sacformer_jax import agents
-from sacformer_jax.agents.sac_update import bellman_target, soft_update, step_weights
+from sacformer_jax.agents.sac_update import (
+    bellman_target,
+    lambda_target,
+    soft_update,
+    step_weights,
+)
 from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.parallel import DataAxis
@@ -94,6 +99,36 @@ def test_bellman_target_at_ordinary_and_terminated_steps():
     )
     # 1 + 0.9 (min(10, 8) - 0.5 (-2)) and 2 alone.
     np.testing.assert_allclose(y, [[9.1, 2.0]], rtol=1e-6)
+
+
+def test_lambda_target_is_the_mean_of_targets_of_one_step_two_and_so_on():
+    """Against the definition: n-step targets weighted by (1 - λ) λ^(n-1), the rest on the last."""
+    rng, gamma, lam, k = np.random.default_rng(0), 0.9, 0.7, 5
+    reward, q, bonus = rng.normal(size=(3, 2, k))  # of B = 2; Q and -α log π after each step
+    goes_on = np.ones((2, k))
+    goes_on[0, 2] = 0.0  # terminated there
+    follows = np.ones((2, k), bool)
+    follows[:, -1] = False
+    follows[0, 2] = False
+    follows[1, 1] = False  # what comes next cannot be judged
+    one_step = reward + gamma * goes_on * (q + bonus)
+    decay = gamma * lam * goes_on * follows
+    got = lambda_target(*(jnp.asarray(x, jnp.float32) for x in (one_step, decay, q)))
+
+    def n_step(b, t, n):
+        """Rewards with their bonuses, and Q after n of them."""
+        total, factor = 0.0, 1.0
+        for i in range(t, t + n):
+            total += factor * (reward[b, i] + gamma * goes_on[b, i] * bonus[b, i])
+            factor *= gamma * goes_on[b, i]
+        return total + factor * q[b, t + n - 1]
+
+    for b in range(2):
+        for t in range(k):
+            most = next(n for n in range(1, k - t + 1) if not follows[b, t + n - 1])
+            weights = [(1 - lam) * lam ** (n - 1) for n in range(1, most)] + [lam ** (most - 1)]
+            expected = sum(w * n_step(b, t, n + 1) for n, w in enumerate(weights))
+            assert float(got[b, t]) == pytest.approx(expected, rel=1e-5)
 
 
 def test_step_weights():
@@ -181,6 +216,38 @@ def test_losses_on_a_fixed_batch_equal_numpy(setup):
     entropy = -(actor_weight * log_prob).sum() / actor_weight.sum()
     assert float(metrics["entropy"]) == pytest.approx(entropy, rel=1e-4)
     assert float(metrics["alpha"]) == pytest.approx(0.3, rel=1e-6)
+
+
+@pytest.mark.parametrize("setup", ["gs"], indirect=True)
+def test_with_td_lambda_the_critics_learn_the_returns_along_the_window(setup):
+    config, spec, update, learner, hyper = setup
+    lam = 0.6
+    window, key = make_window(), jax.random.key(7)
+    along = jax.jit(agents.make(config.replace(td_lambda=lam), spec).update)
+    learner = dataclasses.replace(learner, log_alpha=jnp.float32(np.log(0.3)))
+    _, metrics = along(learner, hyper, window, key)
+    of_one_step = update(learner, hyper, window, key)[1]
+    assert float(metrics["critic_loss"]) != float(of_one_step["critic_loss"])
+
+    following = jax.tree.map(lambda x: x[:, 1:], shown(config, spec, learner, window))
+    next_action, next_log_prob = numpy_sample(following, jax.random.split(key, 3)[1])
+    obs = np.asarray(window.obs, float)
+    next_q = numpy_q(learner.target_critic_params, obs[:, 1:], next_action).min(0)
+    q = numpy_q(learner.critic_params, obs[:, :-1], np.asarray(window.action, float))
+    judged = np.asarray(window.bootstrap_mask)
+    total = norm = 0.0
+    for b in range(B):
+        y = np.zeros(K + 1)
+        for k in reversed(range(K)):
+            later = next_q[b, k]
+            if k + 1 < K and judged[b, k + 1]:
+                later = (1 - lam) * later + lam * y[k + 1]
+            factor = 0.99 * float(window.discount[b, k])
+            y[k] = float(window.reward[b, k]) + factor * (later - 0.3 * next_log_prob[b, k])
+            if judged[b, k]:
+                total += float(window.weight[b]) * ((q[:, b, k] - y[k]) ** 2).sum()
+                norm += float(window.weight[b])
+    assert float(metrics["critic_loss"]) == pytest.approx(total / norm, rel=1e-4)
 
 
 def test_alpha_gradient_sign_and_first_adam_step(setup):

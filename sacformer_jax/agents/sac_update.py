@@ -62,7 +62,7 @@ def lambda_target(one_step: jax.Array, decay: jax.Array, next_value: jax.Array) 
     Args:
       one_step: ``[B, K]``, :func:`bellman_target`.
       decay: ``[B, K]``; 0 where the next step of the window does not follow, or cannot be judged.
-      next_value: ``[B, K]``, what ``one_step`` has of the critics: the least of them after the step.
+      next_value: ``[B, K]``, what ``one_step`` has of the critics: their least after the step.
 
     Returns:
       ``[B, K]``.
