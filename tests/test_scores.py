@@ -9,7 +9,12 @@ import pytest
 from random_returns import random_returns
 from report import scores
 from report.published import CLEANRL, PUBLISHED, ratio_to_cleanrl
-from report.scores import iqm_estimate, mean_estimate, probability_of_improvement
+from report.scores import (
+    iqm_difference,
+    iqm_estimate,
+    mean_estimate,
+    probability_of_improvement,
+)
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -141,9 +146,23 @@ def test_both_sides_of_an_improvement_are_resampled() -> None:
     assert (estimate.value, estimate.low, estimate.high) == (0.75, 0.0, 1.0)
 
 
+def test_the_difference_of_two_interquartile_means() -> None:
+    # x is 1 + {0, 2} of two draws, so 1, 2 (twice as likely) or 3, and y likewise 0, 1 or 2: of the
+    # 16 cases the least difference is 1 - 2, the greatest 3 - 0, each in one.
+    x, y = [np.array([1.0, 3])], [np.array([0.0, 2])]
+    estimate = iqm_difference(x, y)
+    assert (estimate.value, estimate.low, estimate.high) == (1.0, -1.0, 3.0)
+    back = iqm_difference(y, x)
+    assert (back.value, back.low, back.high) == (-1.0, -3.0, 1.0)
+    # The middle half is taken of all tasks together: 2, 3 of 1, 2, 3, 50 less 0.
+    many = iqm_difference([np.array([1.0, 50]), np.array([2.0, 3])], [np.zeros(2), np.zeros(2)])
+    assert many.value == 2.5
+
+
 def test_different_tasks_are_not_compared() -> None:
-    with pytest.raises(ValueError, match="1 tasks against 2"):
-        probability_of_improvement([np.ones(2)], [np.ones(2), np.ones(2)])
+    for compare in (probability_of_improvement, iqm_difference):
+        with pytest.raises(ValueError, match="1 tasks against 2"):
+            compare([np.ones(2)], [np.ones(2), np.ones(2)])
 
 
 def test_single_seeds_have_no_interval() -> None:

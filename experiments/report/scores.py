@@ -106,6 +106,34 @@ def mean_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Esti
     return _estimate(lambda all_: np.concatenate(all_, axis=-1).mean(axis=-1), by_task, resamples)
 
 
+def iqm_difference(
+    of: Sequence[Array], less: Sequence[Array], resamples: int = _RESAMPLES
+) -> Estimate:
+    """The interquartile mean of one less that of the other. Both are resampled independently.
+
+    Args:
+      of: by task.
+      less: by task, the same tasks.
+      resamples: of the bootstrap.
+
+    Raises:
+      ValueError: there are other numbers of tasks.
+    """
+    tasks = _common(of, less)
+
+    def statistic(samples: Sequence[Array]) -> Any:
+        return interquartile_mean(samples[:tasks]) - interquartile_mean(samples[tasks:])
+
+    return _estimate(statistic, [*of, *less], resamples)
+
+
+def _common(one: Sequence[Array], other: Sequence[Array]) -> int:
+    """How many tasks both have."""
+    if len(one) != len(other):
+        raise ValueError(f"{len(one)} tasks against {len(other)}")
+    return len(one)
+
+
 def probability_of_improvement(
     of: Sequence[Array], over: Sequence[Array], resamples: int = _RESAMPLES
 ) -> Estimate:
@@ -117,10 +145,11 @@ def probability_of_improvement(
       of: X by task.
       over: Y by task, the same tasks.
       resamples: of the bootstrap.
+
+    Raises:
+      ValueError: there are other numbers of tasks.
     """
-    tasks = len(of)
-    if tasks != len(over):
-        raise ValueError(f"{tasks} tasks against {len(over)}")
+    tasks = _common(of, over)
 
     def statistic(samples: Sequence[Array]) -> Any:
         pairs = zip(samples[:tasks], samples[tasks:], strict=True)

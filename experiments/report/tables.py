@@ -3,8 +3,9 @@
 The CSV has a line for each number: ``study, task, variant, statistic, seed, value, low, high``.
 ``task`` is empty for statistics over tasks, ``seed`` but for single runs, ``low`` and ``high``
 where there is no 95 % interval. Statistics: ``score`` of a run, ``mean`` and ``std`` over the
-seeds, ``env_steps`` at the end, ``iqm`` of normalized scores, ``improvement`` (probability of, over
-the baseline), ``ratio_to_cleanrl`` (study baselines).
+seeds, ``env_steps`` at the end, ``iqm`` of normalized scores, ``difference`` (of it, less the
+baseline's), ``improvement`` (probability of, over the baseline), ``ratio_to_cleanrl`` (study
+baselines).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from report.scores import (
     REFERENCE_SOURCE,
     Estimate,
     can_normalize,
+    iqm_difference,
     iqm_estimate,
     normalized,
     probability_of_improvement,
@@ -39,13 +41,15 @@ class Aggregate:
     Attributes:
       variant: its name.
       iqm: of normalized scores; None where a task of the study is not finished.
-      improvement: probability of, over the baseline; None for the baseline itself, and where the
-        two have no finished task in common.
-      tasks: those that ``improvement`` is of.
+      difference: of the interquartile mean, less the baseline's; None for the baseline itself, and
+        where the two have no finished task with normalized scores in common.
+      improvement: probability of, over the baseline; likewise, of any task.
+      tasks: those that the two have in common.
     """
 
     variant: str
     iqm: Estimate | None
+    difference: Estimate | None
     improvement: Estimate | None
     tasks: list[str]
 
@@ -56,18 +60,24 @@ def aggregates(study: StudyLines, baseline: str) -> list[Aggregate]:
     made = []
     for variant in study.variants:
         finished = study.finished_tasks(variant)
-        iqm = improvement = None
+        iqm = difference = improvement = None
         if rated and set(rated) <= set(finished):
             iqm = iqm_estimate(
                 [normalized(task, study.lines[task, variant].scores) for task in rated]
             )
         common = [task for task in finished if study.finished(task, baseline)]
+        comparable = [task for task in common if task in rated]
+        if variant != baseline and comparable:
+            difference = iqm_difference(
+                [normalized(task, study.lines[task, variant].scores) for task in comparable],
+                [normalized(task, study.lines[task, baseline].scores) for task in comparable],
+            )
         if variant != baseline and common:
             improvement = probability_of_improvement(
                 [study.lines[task, variant].scores for task in common],
                 [study.lines[task, baseline].scores for task in common],
             )
-        made.append(Aggregate(variant, iqm, improvement, common))
+        made.append(Aggregate(variant, iqm, difference, improvement, common))
     return made
 
 
@@ -104,7 +114,11 @@ def _csv_rows(study: StudyLines, made: Sequence[Aggregate]) -> Iterator[tuple[An
         if study.name in COMPARED_WITH_PUBLISHED and ratio is not None:
             yield task, variant, "ratio_to_cleanrl", "", _digits(ratio, 4), "", ""
     for one in made:
-        for name, estimate in (("iqm", one.iqm), ("improvement", one.improvement)):
+        for name, estimate in (
+            ("iqm", one.iqm),
+            ("difference", one.difference),
+            ("improvement", one.improvement),
+        ):
             if estimate is not None:
                 numbers = (estimate.value, estimate.low, estimate.high)
                 yield "", one.variant, name, "", *(_digits(number, 4) for number in numbers)
@@ -206,7 +220,8 @@ def _about_aggregates(study: StudyLines, baseline: str) -> str:
         else ""
     )
     return (
-        f"{text}Probability that a run is better than one of {label_of(baseline)}, mean over "
+        f"{text}Its difference from that of {label_of(baseline)}, on the tasks that both have "
+        f"finished. Probability that a run is better than one of {label_of(baseline)}, mean over "
         "tasks. In brackets 95 % stratified bootstrap intervals (arXiv 2108.13264): none of single "
         "seeds, rough of few."
     )
@@ -218,16 +233,18 @@ def _aggregates_table(study: StudyLines, made: Sequence[Aggregate], baseline: st
         better = _bracketed(one.improvement)
         if one.improvement is not None and one.tasks != study.tasks:
             better += f" on {', '.join(one.tasks)} only"
-        rows.append([label_of(one.variant), _bracketed(one.iqm), better])
-    return _table(["", "interquartile mean", f"P(better than {label_of(baseline)})"], rows)
+        difference = _bracketed(one.difference)
+        rows.append([label_of(one.variant), _bracketed(one.iqm), difference, better])
+    name = label_of(baseline)
+    return _table(["", "interquartile mean", f"less {name}'s", f"P(better than {name})"], rows)
 
 
 def _bracketed(estimate: Estimate | None) -> str:
     if estimate is None:
         return "–"
     if math.isnan(estimate.low):
-        return f"{estimate.value:.2f}"
-    return f"{estimate.value:.2f} [{estimate.low:.2f}, {estimate.high:.2f}]"
+        return f"{estimate.value:z.2f}"
+    return f"{estimate.value:z.2f} [{estimate.low:z.2f}, {estimate.high:z.2f}]"
 
 
 def _published_table(study: StudyLines) -> str:
