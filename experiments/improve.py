@@ -29,6 +29,9 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "state-path": {"state_path_width": 256},
     "td-lambda": {"td_lambda": 0.5},
     "critic-norm": {"critic_layer_norm": True},
+    "critic-features": {"critic_features": True},
+    "predicting": {"prediction_weight": 1.0},
+    "predicting-features": {"critic_features": True, "prediction_weight": 1.0},
     "short-windows": {"context_length": 3, "batch_size": 64},
     # What the upper blocks have heard of is kept in acting, as training shows it.
     "burn-in": {"burn_in": K - 1, "acting_context": "episode", "acting_context_limit": K},

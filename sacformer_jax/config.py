@@ -192,6 +192,8 @@ class CriticConfig:
     """Width of hidden layers (mlp) or tokens (transformer)."""
     critic_history: int = 1
     """States that a critic sees, the newest included, with the actions between them (mlp)."""
+    critic_features: bool = False
+    """Critics see the transformer's features of the past, too, as given (mlp)."""
     critic_heads: int = 1
     """Attention heads (transformer)."""
     critic_activation: Activation = "relu"
@@ -220,6 +222,8 @@ class LearningConfig:
     """Adam step size of the critics."""
     discount: float = 0.99
     """Discount factor γ."""
+    prediction_weight: float = 0.0
+    """Weight of the actor's loss in predicting the next observation (sacformer); 0: it does not."""
     td_lambda: float = 0.0
     """λ of the critics' targets along a window: 0 for one step, towards 1 for all that follow."""
     tau: float = 0.005

@@ -31,8 +31,9 @@ class CriticInputs:
     """What a critic may look at besides the action it judges.
 
     Attributes:
-      obs: ``[B, K, O]`` normalized, at the steps.
-      next_obs: ``[B, K, O]`` normalized, after them.
+      obs: ``[B, K, O]`` normalized, at the steps; the actor's features after them, where critics
+        are to see those.
+      next_obs: ``[B, K, O]`` likewise, after the steps.
       action: ``[B, K, A]``, as replayed.
       time_step: int32 ``[B, K+1]``; looked at by the transformer alone.
       state_mask: bool ``[B, K+1]``; looked at by those that see the past, whose windows are

@@ -24,6 +24,8 @@ from sacformer_jax.transformer import (
 )
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+_PREDICTION_RATIO = 4
+"""Hidden width of what predicts the next state over the trunk's."""
 KERNEL_INITS = {
     "lecun": nn.initializers.lecun_uniform(),
     "xavier": nn.initializers.xavier_uniform(),
@@ -54,10 +56,15 @@ class ActorOutput:
     Attributes:
       gaussian: the action distributions.
       seen: what the actor's next call may take as its past; empty for one that sees one state.
+      features: of the trunk at the states, ``[..., D]``; None of an actor without one.
+      prediction: what it expects the next state to be more than this one, ``[..., O]`` normalized,
+        under the action that was taken; None of an actor that predicts nothing.
     """
 
     gaussian: GaussianParams
     seen: Seen
+    features: jax.Array | None = None
+    prediction: jax.Array | None = None
 
 
 def head_init(scale: float) -> nn.initializers.Initializer:
@@ -126,6 +133,7 @@ class TransformerActor(nn.Module):
       state_path: widths of an MLP on the state alone, whose features go to the heads, those of the
         trunk added to them by a layer that starts at zero: the policy starts as SAC's, and learns
         what the past has to add (a residual path around the trunk). None: the trunk alone.
+      predicts: say, of states and the actions taken there, which state follows.
       cached: act on an episode step by step: keys and values of the K newest steps are kept in
         the collection ``"cache"`` (which must be mutable) instead of being computed again.
     """
@@ -137,6 +145,7 @@ class TransformerActor(nn.Module):
     head_init_scale: float
     tokens: Tokens = "gs"
     state_path: Sequence[int] | None = None
+    predicts: bool = False
     cached: bool = False
 
     @nn.compact
@@ -166,7 +175,7 @@ class TransformerActor(nn.Module):
 
         Returns:
           mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing. With a
-          cache ``[B, 1, A]``.
+          cache ``[B, 1, A]``, and nothing is predicted.
         """
         step = {"return": return_to_go[..., None], "state": obs}
         if self.tokens == "gsa":
@@ -175,14 +184,26 @@ class TransformerActor(nn.Module):
             features, seen = self._newest_features(step, time_step, deterministic)
         else:
             features, seen = self._features(step, time_step, state_mask, deterministic, past)
+        prediction = None
+        if self.predicts and not self.cached:
+            prediction = self._predicted(features, action, obs.shape[-1])
+        output = features
         if self.state_path is not None:
             newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
             activation, dtype = self.config.activation, self.config.dtype
             by_state = MLP(self.state_path, activation, dtype=dtype, name="state_path")(newest)
             zeros = nn.initializers.zeros
-            features = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(features)
+            output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(features)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
-        return ActorOutput(heads(features), seen)
+        return ActorOutput(heads(output), seen, features, prediction)
+
+    def _predicted(self, features: jax.Array, action: jax.Array, size: int) -> jax.Array:
+        """How the state changes under the actions taken, ``[B, T, O]``."""
+        cfg = self.config
+        both = jnp.concatenate([features, action], axis=-1)
+        widths = (_PREDICTION_RATIO * cfg.width,)
+        hidden = MLP(widths, cfg.activation, dtype=cfg.dtype, name="prediction")(both)
+        return Dense(size, nn.initializers.zeros, name="prediction_out")(hidden)
 
     def _features(
         self,

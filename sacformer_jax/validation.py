@@ -47,7 +47,7 @@ def check(config: Config) -> None:
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
         "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
         "value_coefficient", "pretrain_updates", "video_every", "burn_in", "state_path_width",
-        "td_lambda",
+        "td_lambda", "prediction_weight",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
     _check_seeds(config)
@@ -93,6 +93,17 @@ def _check_actor(config: Config) -> None:
             actor.state_path_width == 0,
             f"state_path_width={actor.state_path_width}: agent={config.agent} has no transformer "
             "to go around; use state_path_width=0, or agent=sacformer",
+        )
+        weight = config.learning.prediction_weight
+        _require(
+            weight == 0,
+            f"prediction_weight={weight}: agent={config.agent} predicts nothing; use "
+            "prediction_weight=0, or agent=sacformer",
+        )
+        _require(
+            not config.critic.critic_features,
+            f"critic_features=True: agent={config.agent} has no transformer whose features critics "
+            "could see; use critic_features=False, or agent=sacformer",
         )
         _require(
             context.context_length == 1,
@@ -152,6 +163,12 @@ def _check_past(config: Config) -> None:
         critic.critic_history == 1 or critic.critic == "mlp",
         f"critic_history={critic.critic_history}: is for critic=mlp; a transformer sees the whole "
         "window; use critic_history=1",
+    )
+    _require(
+        not critic.critic_features or (critic.critic == "mlp" and critic.critic_history == 1),
+        f"critic_features=True: with critic={critic.critic} and "
+        f"critic_history={critic.critic_history} critics see the past by themselves; use "
+        "critic_features=False, or critic=mlp and critic_history=1",
     )
     _require(
         critic.critic_history <= context.window_length + 1,

@@ -406,8 +406,13 @@ BAD: list[tuple[dict[str, Any], str]] = [
             {"critic_history": 2},
             {"td_lambda": 0.5},
             {"state_path_width": 8},
+            {"prediction_weight": 1.0},
+            {"critic_features": True},
         )
     ),
+    ({"prediction_weight": -1.0}, "prediction_weight=-1.0"),
+    ({"critic_features": True, "critic": "transformer"}, "critic=mlp"),
+    ({"critic_features": True, "critic_history": 2}, "critic_history=1"),
     ({"updates_per_env_step": 0}, "updates_per_env_step=0.0"),
     ({"updates_per_env_step": math.inf}, "updates_per_env_step=inf"),
     ({"updates_per_env_step": 1e-5}, "simpler fraction"),

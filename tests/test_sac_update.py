@@ -74,16 +74,20 @@ def taken(window):
     return jnp.concatenate([window.action, jnp.full((len(window.action), 1, 1), 7.0)], axis=1)
 
 
-def networks(config, spec):
-    actor = TransformerActor(
+def transformer(config, spec, **fields):
+    return TransformerActor(
         TransformerConfig(1, 16, 1, 4, 0.0, "relu"),
         1,
         K,
         spec.max_episode_steps + 1,
         0.01,
         config.context.tokens,
+        **fields,
     )
-    return gaussian_of(actor), twin(MLPCritic)((32, 32), "relu", False)
+
+
+def networks(config, spec):
+    return gaussian_of(transformer(config, spec)), twin(MLPCritic)((32, 32), "relu", False)
 
 
 # --- by hand ---------------------------------------------------------------------------------
@@ -153,8 +157,13 @@ def test_soft_update():
 
 def shown(config, spec, learner, window):
     """The policy's distributions at the K+1 states, conditioned on the commanded return."""
-    return networks(config, spec)[0](
-        learner.actor_params,
+    return output_of(transformer(config, spec), learner.actor_params, window).gaussian
+
+
+def output_of(actor, actor_params, window):
+    """All that an actor says of the K+1 states."""
+    return actor.apply(
+        actor_params,
         window.obs,
         taken(window),
         (0.0 - window.return_so_far) / 10.0,  # (target - so far) / scale
@@ -248,6 +257,68 @@ def test_with_td_lambda_the_critics_learn_the_returns_along_the_window(setup):
                 total += float(window.weight[b]) * ((q[:, b, k] - y[k]) ** 2).sum()
                 norm += float(window.weight[b])
     assert float(metrics["critic_loss"]) == pytest.approx(total / norm, rel=1e-4)
+
+
+def test_critics_may_see_what_the_transformer_makes_of_the_past():
+    config = point_config(context_length=K, critic_features=True)
+    spec = point_env(1).spec
+    agent = agents.make(config, spec)
+    learner = jax.jit(agent.init)(jax.random.key(0))
+    window, key = make_window(), jax.random.key(7)
+    _, metrics = jax.jit(agent.update)(learner, hyperparameters(config, 1), window, key)
+
+    output = output_of(transformer(config, spec), learner.actor_params, window)
+    seen = np.concatenate([window.obs, output.features], axis=-1).astype(float)  # [B, K+1, O+D]
+    following = jax.tree.map(lambda x: x[:, 1:], output.gaussian)
+    next_action, next_log_prob = numpy_sample(following, jax.random.split(key, 3)[1])
+    next_q = numpy_q(learner.target_critic_params, seen[:, 1:], next_action).min(0)
+    alpha = float(jnp.exp(learner.log_alpha))
+    y = window.reward + 0.99 * window.discount * (next_q - alpha * next_log_prob)
+    q = numpy_q(learner.critic_params, seen[:, :-1], np.asarray(window.action, float))
+    weight = window.weight[:, None] * window.bootstrap_mask
+    expected = (weight * ((q - y) ** 2).sum(0)).sum() / weight.sum()
+    assert float(metrics["critic_loss"]) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_the_actor_learns_to_predict_as_far_as_that_weighs():
+    window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
+    moments, losses = {}, {}
+    for weight in (1.0, 3.0):
+        config = point_config(context_length=K, prediction_weight=weight)
+        agent = agents.make(config, spec)
+        learner = jax.jit(agent.init)(jax.random.key(0))
+        # The layer that predicts starts at zero, where it passes no gradient on.
+        kernel = learner.actor_params["params"]["prediction_out"]["kernel"]
+        kernel += jnp.asarray(np.random.default_rng(1).normal(size=kernel.shape), jnp.float32)
+        learner.actor_params["params"]["prediction_out"]["kernel"] = kernel
+        new, metrics = jax.jit(agent.update)(learner, hyperparameters(config, 1), window, key)
+        # The first moment of Adam's first step is a tenth of the gradient.
+        moments[weight] = jax.tree.map(lambda x: 10.0 * x, new.actor_opt.mu["params"])
+        losses[weight] = float(metrics["prediction_loss"])
+    assert losses[1.0] == losses[3.0]
+
+    actor = transformer(config, spec, predicts=True)
+    known = np.asarray(window.bootstrap_mask & window.state_mask[:, 1:])
+    # A mean over the critics' steps: of a step that terminated there is no next observation.
+    weights = np.asarray(window.weight)[:, None] * known
+    weights /= (np.asarray(window.weight)[:, None] * np.asarray(window.bootstrap_mask)).sum()
+
+    def loss(params):
+        prediction = output_of(actor, params, window).prediction[:, :-1]
+        error = prediction - (window.obs[:, 1:] - window.obs[:, :-1])
+        return (weights * 0.5 * (error**2).mean(-1)).sum()
+
+    value, grads = jax.value_and_grad(loss)(learner.actor_params)
+    assert losses[1.0] == pytest.approx(float(value), rel=1e-5)
+    # What is learnt besides is the same for both weights.
+    for name in ("prediction", "prediction_out", "embed_state", "trunk", "heads"):
+        got = jax.tree.map(lambda a, b: (b - a) / 2.0, moments[1.0][name], moments[3.0][name])
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
+            got,
+            grads["params"][name],
+        )
+    assert np.any(grads["params"]["embed_state"]["kernel"])
 
 
 def test_alpha_gradient_sign_and_first_adam_step(setup):

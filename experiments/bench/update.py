@@ -108,7 +108,8 @@ def phases(program: Program, state: TrainState) -> dict[str, Callable[[], Any]]:
     """The parts of an update, each by itself on a batch that stays the same."""
     parts, hyper, learner = sac_parts_of(program), state.hyper, state.learner
     batch_size, window = program.config.replay.batch_size, batch_of(program, state)
-    inputs = sac_update._critic_inputs(parts, learner, window)
+    shown = window_policies(parts, learner.actor_params, learner, hyper, window, jax.random.key(0))
+    inputs = sac_update._critic_inputs(parts, learner, window, shown)
 
     def sample(buffer: BufferState, total: jax.Array, key: jax.Array) -> jax.Array:
         drawn = program.buffer.sample(buffer, key, batch_size, hyper.rtg_discount)

@@ -39,6 +39,7 @@ class OffPolicyParts(AgentParts):
       obs_size: O.
       action_size: A.
       context_length: K.
+      num_critic_features: what critics see of the past as the actor does, beside an observation.
     """
 
     actor: nn.Module
@@ -46,12 +47,13 @@ class OffPolicyParts(AgentParts):
     obs_size: int
     action_size: int
     context_length: int
+    num_critic_features: int = dataclasses.field(default=0, kw_only=True)
 
 
 def init_critics(parts: OffPolicyParts, key: jax.Array) -> Params:
     """Parameters of the critics."""
     steps, states = (1, parts.context_length), (1, parts.context_length + 1)
-    obs = jnp.zeros((*steps, parts.obs_size))
+    obs = jnp.zeros((*steps, parts.obs_size + parts.num_critic_features))
     inputs = CriticInputs(
         obs=obs,
         next_obs=obs,

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -51,6 +52,7 @@ class SACParts(OffPolicyParts):
       tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
       initial_alpha: α at the start.
       td_lambda: λ of the critics' targets along a window.
+      prediction_weight: of the loss in predicting the next observation, in the actor's; 0: none.
     """
 
     acting_actor: nn.Module
@@ -61,6 +63,7 @@ class SACParts(OffPolicyParts):
     tune_alpha: bool
     initial_alpha: float
     td_lambda: float
+    prediction_weight: float
 
 
 def sac_parts(
@@ -91,6 +94,8 @@ def sac_parts(
         tune_alpha=config.learning.tune_alpha,
         initial_alpha=config.learning.alpha,
         td_lambda=config.learning.td_lambda,
+        prediction_weight=config.learning.prediction_weight,
+        num_critic_features=config.actor.actor_width if config.critic.critic_features else 0,
         normalize_obs=config.context.normalize_obs,
         data=data,
     )
@@ -155,17 +160,21 @@ def act(
 # --- training --------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
+@flax.struct.dataclass
 class WindowPolicies:
     """π over windows.
 
     Attributes:
       now: at the K steps, ``[B, K, A]``.
       following: after them, ``[B, K, A]``.
+      prediction: ``[B, K, O]``, how normalized observations change; None if not predicted.
+      features: the trunk's at the steps and after them, ``[B, K, D]`` each; None without a trunk.
     """
 
     now: GaussianParams
     following: GaussianParams
+    prediction: jax.Array | None
+    features: tuple[jax.Array, jax.Array] | None
 
 
 def window_policies(
@@ -227,9 +236,11 @@ def window_policies(
         last = dataclasses.replace(last, mask=window.state_mask)
         unknown = jnp.zeros_like(window.action[:, :1])
         seen = jax.lax.stop_gradient(now.seen)
-        after = look(frozen, last, unknown, following_key, seen).gaussian
-        next_gaussian = jax.tree.map(
-            lambda a, b: jnp.concatenate([a[:, 1:], b], axis=1), now.gaussian, after
+        after = look(frozen, last, unknown, following_key, seen)
+        next_gaussian, next_features = jax.tree.map(
+            lambda a, b: jnp.concatenate([a[:, 1:], b], axis=1),
+            (now.gaussian, now.features),
+            (after.gaussian, after.features),
         )
     else:
         if parts.next_rtg_decrement is None:
@@ -238,8 +249,10 @@ def window_policies(
             next_return_to_go = return_to_go - parts.next_rtg_decrement
         following = dataclasses.replace(following, return_to_go=next_return_to_go)
         # tokens="gs" with scattered windows: no actions are looked at.
-        next_gaussian = look(frozen, following, window.action, following_key).gaussian
-    return WindowPolicies(now=now.gaussian, following=next_gaussian)
+        after = look(frozen, following, window.action, following_key)
+        next_gaussian, next_features = after.gaussian, after.features
+    features = None if now.features is None else (now.features, next_features)
+    return WindowPolicies(now.gaussian, next_gaussian, now.prediction, features)
 
 
 def _training_return_to_go(

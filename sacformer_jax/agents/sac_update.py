@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from sacformer_jax.agents.off_policy import (
     step_critics,
     step_weights,
 )
-from sacformer_jax.agents.sac_policy import SACParts, window_policies
+from sacformer_jax.agents.sac_policy import SACParts, WindowPolicies, window_policies
 from sacformer_jax.critics import CriticInputs
 from sacformer_jax.networks import GaussianParams
 from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
@@ -129,7 +130,8 @@ class _Half:
       inputs: of the critics.
       weights: of the steps.
       gaussian: π at the steps.
-      pull_back: takes a gradient of ``gaussian`` to the actor's parameters.
+      prediction: how observations change after them, ``[B, K, O]``; None if not predicted.
+      pull_back: takes gradients of ``gaussian`` and ``prediction`` to the actor's parameters.
       noise: standard normal ``[B, K, A]``, for the actor's loss.
     """
 
@@ -139,7 +141,8 @@ class _Half:
     inputs: CriticInputs
     weights: StepWeights
     gaussian: GaussianParams
-    pull_back: Callable[[GaussianParams], tuple[Params]]
+    prediction: jax.Array | None
+    pull_back: Callable[[tuple[GaussianParams, jax.Array | None]], tuple[Params]]
     noise: jax.Array
 
 
@@ -151,17 +154,20 @@ def _after_critics(
     # Both in one draw: a draw costs time however small it is.
     next_noise, noise = jax.vmap(lambda key: parts.data.normal(key, window.action.shape))(keys[1:])
 
-    def policies(actor_params: Params) -> tuple[GaussianParams, GaussianParams]:
+    def policies(actor_params: Params) -> tuple[Any, WindowPolicies]:
         dropout_key = parts.data.own_key(keys[0])
         both = window_policies(parts, actor_params, learner, hyper, window, dropout_key)
-        return both.now, both.following
+        return (both.now, both.prediction), both
 
-    gaussian, pull_back, next_gaussian = jax.vjp(policies, learner.actor_params, has_aux=True)
-    inputs, weights = _critic_inputs(parts, learner, window), step_weights(parts, window)
+    outputs, pull_back, both = jax.vjp(policies, learner.actor_params, has_aux=True)
+    gaussian, prediction = outputs
+    inputs, weights = _critic_inputs(parts, learner, window, both), step_weights(parts, window)
     learner, metrics, non_finite = _update_critics(
-        parts, learner, hyper, window, inputs, weights, gaussian, next_gaussian, next_noise
+        parts, learner, hyper, window, inputs, weights, gaussian, both.following, next_noise
     )
-    return _Half(learner, metrics, non_finite, inputs, weights, gaussian, pull_back, noise)
+    return _Half(
+        learner, metrics, non_finite, inputs, weights, gaussian, prediction, pull_back, noise
+    )
 
 
 def _pretrain(
@@ -179,19 +185,20 @@ def _pretrain(
         return jnp.sum(weights.actor * each)
 
     value, gaussian_grads = jax.value_and_grad(loss)(half.gaussian)
-    (grads,) = half.pull_back(gaussian_grads)
+    predicted = _learn_to_predict(parts, half, window)
+    (grads,) = half.pull_back((gaussian_grads, predicted.grads))
     shown = parts.distribution.mode(half.gaussian.mean)
     error = jnp.sum(weights.actor * jnp.mean(jnp.abs(shown - window.action), axis=-1))
-    value, error, grads = parts.data.sum((value, error, grads))
+    value, error, own, grads = parts.data.sum((value, error, predicted.metrics, grads))
     learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
-    return learner, {**half.metrics, **metrics, "action_error": error, "fault": fault}
+    return learner, {**half.metrics, **metrics, **own, "action_error": error, "fault": fault}
 
 
 def _update(
     parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
 ) -> tuple[LearnerState, Metrics]:
     half = _after_critics(parts, learner, hyper, window, key)
-    learner, actor_metrics, fault = _update_actor(parts, hyper, half)
+    learner, actor_metrics, fault = _update_actor(parts, hyper, half, window)
     # Temperature: J(α) = E[-α (log π + target entropy)].
     alpha = _alpha(learner)
     if parts.tune_alpha:
@@ -209,12 +216,19 @@ def _alpha(learner: LearnerState) -> jax.Array:
     return jnp.exp(learner.log_alpha)
 
 
-def _critic_inputs(parts: SACParts, learner: LearnerState, window: Window) -> CriticInputs:
+def _critic_inputs(
+    parts: SACParts, learner: LearnerState, window: Window, both: WindowPolicies
+) -> CriticInputs:
     obs = parts.normalized(learner.normalizer, window.obs)
     if window.following is None:
         now, following = obs[:, :-1], obs[:, 1:]
     else:
         now, following = obs, parts.normalized(learner.normalizer, window.following.obs)
+    if parts.num_critic_features:
+        assert both.features is not None
+        features, next_features = jax.lax.stop_gradient(both.features)
+        now = jnp.concatenate([now, features], axis=-1)
+        following = jnp.concatenate([following, next_features], axis=-1)
     return CriticInputs(now, following, window.action, window.time_step, window.state_mask)
 
 
@@ -261,7 +275,7 @@ def _update_critics(
 
 
 def _update_actor(
-    parts: SACParts, hyper: Hyperparameters, half: _Half
+    parts: SACParts, hyper: Hyperparameters, half: _Half, window: Window
 ) -> tuple[LearnerState, Metrics, jax.Array]:
     """Eq. 10-13, through the distributions whose gradient is pulled back to the parameters."""
     learner, weights, inputs = half.learner, half.weights, half.inputs
@@ -275,8 +289,41 @@ def _update_actor(
         return jnp.sum(weights.actor * (alpha * log_prob - min_q)), log_prob
 
     (value, log_prob), gaussian_grads = jax.value_and_grad(loss, has_aux=True)(half.gaussian)
-    (grads,) = half.pull_back(gaussian_grads)
+    predicted = _learn_to_predict(parts, half, window)
+    (grads,) = half.pull_back((gaussian_grads, predicted.grads))
     entropy = -jnp.sum(weights.actor * log_prob)
-    value, entropy, grads = parts.data.sum((value, entropy, grads))
+    value, entropy, own, grads = parts.data.sum((value, entropy, predicted.metrics, grads))
     learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
-    return learner, {**metrics, "entropy": entropy}, fault
+    return learner, {**metrics, **own, "entropy": entropy}, fault
+
+
+@dataclasses.dataclass(frozen=True)
+class _Predicted:
+    """How well the next observations were foretold.
+
+    Attributes:
+      grads: of the weighted loss to the prediction ``[B, K, O]``; None if there is none.
+      metrics: its metrics.
+    """
+
+    grads: jax.Array | None
+    metrics: Metrics
+
+
+def _learn_to_predict(parts: SACParts, half: _Half, window: Window) -> _Predicted:
+    """Half the squared error of the predicted change of an observation, mean over its numbers and
+    the steps whose next observation is known.
+    """
+    if half.prediction is None:
+        return _Predicted(None, {})
+    size, following = parts.obs_size, window.following
+    known = window.state_mask[:, 1:] if following is None else following.mask
+    weight = half.weights.critic * known
+    change = half.inputs.next_obs[..., :size] - half.inputs.obs[..., :size]
+
+    def loss(prediction: jax.Array) -> jax.Array:
+        each = 0.5 * jnp.mean((prediction - change) ** 2, axis=-1)
+        return jnp.sum(weight * each)
+
+    value, grads = jax.value_and_grad(loss)(half.prediction)
+    return _Predicted(parts.prediction_weight * grads, {"prediction_loss": value})

@@ -31,6 +31,7 @@ def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
         state_path=(settings.state_path_width,) * 2 if settings.state_path_width else None,
+        predicts=config.learning.prediction_weight > 0,
     )
 
 
