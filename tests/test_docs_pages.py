@@ -94,7 +94,7 @@ PPO = {"prefill_env_steps": 0, "tune_alpha": False, "rollout_steps": 32, "miniba
 
 
 def test_the_metrics_of_training_are_explained() -> None:
-    written = _metrics()
+    written = _metrics(prediction_weight=1.0)
     for agent in ("td3", "ddpg"):
         written |= _metrics(agent=agent, tune_alpha=False, **MLP)
     written |= _metrics(agent="ppo", **PPO, **MLP)
@@ -109,7 +109,9 @@ def test_the_metrics_of_evaluation_are_explained() -> None:
 
 
 def test_the_metrics_of_pretraining_are_explained() -> None:
-    config = point_config(dataset="some", pretrain_updates=8, prefill_env_steps=0)
+    config = point_config(
+        dataset="some", pretrain_updates=8, prefill_env_steps=0, prediction_weight=1.0
+    )
     program = make_program(config, point_env(4))
     state = jax.eval_shape(program.init, jax.random.key(0))
     assert program.pretrain_chunk is not None
