@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sacformer_jax.agents.core import Agent
-from sacformer_jax.agents.sac_policy import sac_parts
+from sacformer_jax.agents.sac_policy import SACParts, sac_parts
 from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
@@ -13,6 +13,11 @@ from sacformer_jax.parallel import DataAxis
 
 def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
     """Builds SAC for an environment."""
+    return make_sac_agent(make_parts(config, spec, data))
+
+
+def make_parts(config: Config, spec: EnvSpec, data: DataAxis) -> SACParts:
+    """What SAC's functions are bound to."""
     actor = MLPActor(
         widths=(config.actor.actor_width,) * config.actor.actor_layers,
         activation=config.actor.actor_activation,
@@ -20,4 +25,4 @@ def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
         head_init_scale=config.actor.head_init_scale,
         dtype=config.precision.compute_dtype,
     )
-    return make_sac_agent(sac_parts(config, spec, data, actor))
+    return sac_parts(config, spec, data, actor)

@@ -130,6 +130,33 @@ def act(
     parts: SACParts, policy: PolicyState, context: Context, key: jax.Array, explore: bool
 ) -> Acted:
     """Chooses actions from contexts, conditioned by Eq. 1 from the target return."""
+    outlook = acting_outlook(parts, policy, context, key)
+    mean, log_std = outlook.gaussian.mean, outlook.gaussian.log_std
+    if explore:
+        noise = parts.data.normal(key, mean.shape)
+        action = parts.distribution.sample_and_log_prob(noise, mean, log_std)[0]
+    else:
+        action = parts.distribution.mode(mean)
+    return Acted(action, outlook.context)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlook:
+    """π at the newest pair of each context.
+
+    Attributes:
+      gaussian: ``[N, A]``.
+      context: the contexts, whose caches now hold that pair too.
+    """
+
+    gaussian: GaussianParams
+    context: Context
+
+
+def acting_outlook(
+    parts: SACParts, policy: PolicyState, context: Context, key: jax.Array
+) -> Outlook:
+    """What :func:`act` draws from; ``key`` matters only where dropout is on in acting."""
     return_to_go = commanded_return_to_go(
         context.return_so_far, policy.target_return, policy.return_scale
     )
@@ -147,14 +174,8 @@ def act(
         mutable=["cache"],
     )
     acted, changed = output
-    gaussian = acted.gaussian
-    mean, log_std = gaussian.mean[:, -1], gaussian.log_std[:, -1]
-    if explore:
-        noise = parts.data.normal(key, mean.shape)
-        action = parts.distribution.sample_and_log_prob(noise, mean, log_std)[0]
-    else:
-        action = parts.distribution.mode(mean)
-    return Acted(action, dataclasses.replace(context, cache=changed.get("cache", {})))
+    newest = jax.tree.map(lambda x: x[:, -1], acted.gaussian)
+    return Outlook(newest, dataclasses.replace(context, cache=changed.get("cache", {})))
 
 
 # --- training --------------------------------------------------------------------------------
@@ -222,7 +243,7 @@ def window_policies(
 
     now_key, following_key = jax.random.split(key)
     frozen = jax.lax.stop_gradient(actor_params)
-    return_to_go = _training_return_to_go(parts, window, hyper)  # [B, K+1], or [B, K] scattered
+    return_to_go = training_return_to_go(parts, window, hyper)  # [B, K+1], or [B, K] scattered
     everything = States(
         window.obs, window.return_so_far, return_to_go, window.time_step, window.state_mask
     )
@@ -244,7 +265,7 @@ def window_policies(
         )
     else:
         if parts.next_rtg_decrement is None:
-            next_return_to_go = _training_return_to_go(parts, following, hyper)
+            next_return_to_go = training_return_to_go(parts, following, hyper)
         else:
             next_return_to_go = return_to_go - parts.next_rtg_decrement
         following = dataclasses.replace(following, return_to_go=next_return_to_go)
@@ -255,7 +276,7 @@ def window_policies(
     return WindowPolicies(now.gaussian, next_gaussian, now.prediction, features)
 
 
-def _training_return_to_go(
+def training_return_to_go(
     parts: SACParts, states: Window | States, hyper: Hyperparameters
 ) -> jax.Array:
     """What the return tokens show in training, scaled."""

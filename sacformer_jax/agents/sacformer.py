@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sacformer_jax.agents.core import Agent
-from sacformer_jax.agents.sac_policy import sac_parts
+from sacformer_jax.agents.sac_policy import SACParts, sac_parts
 from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
@@ -45,7 +45,12 @@ def acting_pairs(config: Config, spec: EnvSpec) -> int:
 
 def make(config: Config, spec: EnvSpec, data: DataAxis) -> Agent:
     """Builds SACFormer for an environment."""
+    return make_sac_agent(make_parts(config, spec, data))
+
+
+def make_parts(config: Config, spec: EnvSpec, data: DataAxis) -> SACParts:
+    """What SACFormer's functions are bound to."""
     actor = acting_actor = make_actor(config, spec)
     if config.context.acting_context == "episode":
         acting_actor = actor.clone(context_length=acting_pairs(config, spec), cached=True)
-    return make_sac_agent(sac_parts(config, spec, data, actor, acting_actor))
+    return sac_parts(config, spec, data, actor, acting_actor)

@@ -1,0 +1,1 @@
+"""What the networks of a trained run are like; see experiments/diagnose.py."""
