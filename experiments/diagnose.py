@@ -38,15 +38,7 @@ from diagnosis.table import Runs, rows, table
 from rich.console import Console
 
 from sacformer_jax import CheckpointError, ConfigError
-
-
-def labels(paths: Sequence[Path]) -> list[str]:
-    """The folders' names, or as much of their paths as tells them apart."""
-    for parts in range(1, max(len(path.absolute().parts) for path in paths) + 1):
-        names = ["/".join(path.absolute().parts[-parts:]) for path in paths]
-        if len(set(names)) == len(names):
-            return names
-    raise ConfigError("run: must be given once each")
+from sacformer_jax.report.reading import labels
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

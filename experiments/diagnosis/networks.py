@@ -62,44 +62,52 @@ class Activations:
     """What was seen in a network while it ran.
 
     Attributes:
+      output: of the network.
       features: what went into its heads, ``[..., D]``.
       layers: by name, what came out of activation functions, ``[..., H]``.
     """
 
+    output: Any = None
     features: np.ndarray | None = None
     layers: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
-def activations(run: Callable[[], Any]) -> Activations:
-    """Runs a network, not jitted, and looks at its layers on the way.
+def activations(run: Callable[..., Any], *arguments: Any) -> Activations:
+    """Jits and runs a network, and looks at its layers on the way.
 
     Critics are vmapped inside their own functions, where values are tracers: a host call takes them
-    out, all critics at once, ``[C, ...]``.
+    out, of all critics at once, ``[C, ...]``, and hands them on as they are.
     """
-    seen = Activations()
+    seen, before, functions = Activations(), {}, {}
 
-    def take(keep: Callable[[np.ndarray], None], value: jax.Array) -> None:
+    def take(keep: Callable[[np.ndarray], None], value: jax.Array) -> jax.Array:
         def kept(array: Any) -> np.ndarray:
-            keep(np.asarray(array))
-            return np.zeros(np.shape(array), np.float32)
+            array = np.array(array)
+            keep(array)
+            return array
 
-        shape = jax.ShapeDtypeStruct(value.shape, jnp.float32)
-        jax.pure_callback(kept, shape, value, vmap_method="broadcast_all")
+        shape = jax.ShapeDtypeStruct(value.shape, value.dtype)
+        taken: jax.Array = jax.pure_callback(kept, shape, value, vmap_method="broadcast_all")
+        return taken
 
     def look(call: Any, args: Any, kwargs: Any, context: nn.module.InterceptorContext) -> Any:
-        module, result = context.module, call(*args, **kwargs)
+        module = context.module
         if context.method_name != "__call__":
-            return result
+            return call(*args, **kwargs)
         if module.name in _HEADS:
-            take(lambda array: setattr(seen, "features", array), args[0])
-        activation = _activation_after(module)
+            args = (take(lambda array: setattr(seen, "features", array), args[0]), *args[1:])
+        result, activation = call(*args, **kwargs), _activation_after(module)
         if activation is not None:
             name = _layer_name(module)
-            take(lambda array: seen.layers.update({name: array}), activation(result))
+            functions[name] = activation
+            result = take(lambda array: before.update({name: array}), result)
         return result
 
     with nn.intercept_methods(look):
-        run()
+        # A function of its own: what was traced before would be run again as it was.
+        seen.output = jax.device_get(jax.jit(lambda *given: run(*given))(*arguments))
+    # In the order of the layers, not of the calls.
+    seen.layers = {name: np.asarray(of(before[name])) for name, of in functions.items()}
     return seen
 
 
@@ -141,10 +149,14 @@ def representation_numbers(subject: Subject, windows: Window) -> dict[str, float
     on_windows = dataclasses.replace(parts, acting_actor=parts.actor)
     contexts: Context = contexts_of(windows, subject.config.context.context_length)
     actor = activations(
-        lambda: acting_outlook(on_windows, subject.policy, contexts, jax.random.key(0))
+        lambda policy, contexts: (
+            acting_outlook(on_windows, policy, contexts, jax.random.key(0)).gaussian
+        ),
+        subject.policy,
+        contexts,
     )
     inputs = critic_inputs(subject, windows)
-    critics = activations(lambda: parts.critics.now(learner.critic_params, inputs, inputs.action))
+    critics = activations(parts.critics.now, learner.critic_params, inputs, inputs.action)
     numbers = {}
     for network, seen in (("actor", actor), ("critics", critics)):
         assert seen.features is not None
