@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from diagnosis.gradients import by_group, make_gradients, update_of
 from diagnosis.history import Change, _without_time, acting_agent
-from diagnosis.networks import activations, critic_inputs
+from diagnosis.networks import activations, inputs_of
 from diagnosis.numbers import (
     dormant_share,
     effective_rank,
@@ -250,7 +250,7 @@ def test_activations_of_mlps_equal_numpy(sac: Subject) -> None:
     np.testing.assert_allclose(seen.layers["mlp_0"], first, atol=1e-5)
     np.testing.assert_allclose(seen.features, last, atol=1e-5)
 
-    inputs = critic_inputs(sac, windows)
+    inputs = inputs_of(sac, windows)
     plain = parts.critics.now(learner.critic_params, inputs, inputs.action)
     seen = activations(parts.critics.now, learner.critic_params, inputs, inputs.action)
     np.testing.assert_allclose(seen.output, plain, atol=1e-6)
@@ -324,6 +324,7 @@ def test_a_critic_of_known_bias(sac: Subject) -> None:
         obs=np.zeros((*shape, 2), np.float32), action=np.zeros((*shape, 1), np.float32),
         log_prob=np.full(shape, -5.0, np.float32), reward=np.ones(shape, np.float32),
         terminated=np.zeros(shape, bool), done=done, bad=np.zeros(shape, bool),
+        features=np.zeros((*shape, 0), np.float32),
     )  # fmt: skip
     learner = dataclasses.replace(
         sac.state.learner, critic_params={"q": jnp.array([5.0, 3.0])}, log_alpha=jnp.float32(-50.0)
@@ -353,15 +354,18 @@ def test_steps_are_judged_at_the_end_of_windows_of_their_episode(sac: Subject) -
         seen["inputs"], seen["candidate"] = inputs, candidate
         steps = jnp.where(inputs.state_mask[:, :-1], inputs.obs[..., 0], 0.0)
         q = jnp.cumsum(steps, axis=1) + 1_000.0 * candidate[..., 0] + inputs.time_step[:, :-1] / 8
+        q += inputs.obs[..., 2]
         return jnp.stack([q, q + 1.0])
 
     nothing = Critics(init=lambda *_: None, now=now, following=lambda *_: jnp.zeros(()))
     parts = dataclasses.replace(sac.tools.parts, critics=nothing)
     obs = np.arange(1.0, 13.0, dtype=np.float32).reshape(6, 2)
     action = np.arange(6, dtype=np.float32)[:, None] / 10
-    found = make_judge(parts, 3)(sac.state.learner, obs, action)
+    features = 100.0 * np.arange(6, dtype=np.float32)[:, None]
+    found = make_judge(parts, 3)(sac.state.learner, obs, features, action)
     expected = [
-        obs[max(0, t - 2) : t + 1, 0].sum() + 1_000 * action[t, 0] + t / 8 for t in range(6)
+        obs[max(0, t - 2) : t + 1, 0].sum() + 1_000 * action[t, 0] + t / 8 + 100 * t
+        for t in range(6)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert seen["inputs"].time_step.shape == (6, 4)

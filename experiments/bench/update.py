@@ -109,7 +109,7 @@ def phases(program: Program, state: TrainState) -> dict[str, Callable[[], Any]]:
     parts, hyper, learner = sac_parts_of(program), state.hyper, state.learner
     batch_size, window = program.config.replay.batch_size, batch_of(program, state)
     shown = window_policies(parts, learner.actor_params, learner, hyper, window, jax.random.key(0))
-    inputs = sac_update._critic_inputs(parts, learner, window, shown)
+    inputs = sac_update.critic_inputs(parts, learner, window, shown)
 
     def sample(buffer: BufferState, total: jax.Array, key: jax.Array) -> jax.Array:
         drawn = program.buffer.sample(buffer, key, batch_size, hyper.rtg_discount)

@@ -14,7 +14,8 @@ import numpy as np
 
 from diagnosis.numbers import dormant_share, effective_rank
 from diagnosis.subject import Subject, contexts_of
-from sacformer_jax.agents.sac_policy import acting_outlook
+from sacformer_jax.agents.sac_policy import acting_outlook, window_policies
+from sacformer_jax.agents.sac_update import critic_inputs
 from sacformer_jax.attention import acting_attention
 from sacformer_jax.critics import CriticInputs
 from sacformer_jax.networks import MLP
@@ -107,7 +108,9 @@ def activations(run: Callable[..., Any], *arguments: Any) -> Activations:
         # A function of its own: what was traced before would be run again as it was.
         seen.output = jax.device_get(jax.jit(lambda *given: run(*given))(*arguments))
     # In the order of the layers, not of the calls.
-    seen.layers = {name: np.asarray(of(before[name])) for name, of in functions.items()}
+    seen.layers = {
+        name: np.asarray(of(jnp.asarray(before[name]))) for name, of in functions.items()
+    }
     return seen
 
 
@@ -130,14 +133,19 @@ def _layer_name(module: nn.Module) -> str:
     return f"{module.parent.name}_{number}"
 
 
-def critic_inputs(subject: Subject, windows: Window) -> CriticInputs:
-    """What critics may look at of windows."""
-    obs = subject.tools.parts.normalized(subject.policy.normalizer, jnp.asarray(windows.obs))
-    if windows.following is None:
-        now, following = obs[:, :-1], obs[:, 1:]
-    else:
-        now = following = obs  # critics that look at the next state see no scattered windows
-    return CriticInputs(now, following, windows.action, windows.time_step, windows.state_mask)
+def inputs_of(subject: Subject, windows: Window) -> CriticInputs:
+    """What critics may look at of windows, as in an update."""
+    parts, state = subject.tools.parts, subject.state
+    learner = state.learner
+
+    @jax.jit
+    def inputs(windows: Window) -> CriticInputs:
+        key = jax.random.key(0)
+        both = window_policies(parts, learner.actor_params, learner, state.hyper, windows, key)
+        return critic_inputs(parts, learner, windows, both)
+
+    found: CriticInputs = inputs(windows)
+    return found
 
 
 def representation_numbers(subject: Subject, windows: Window) -> dict[str, float]:
@@ -155,7 +163,7 @@ def representation_numbers(subject: Subject, windows: Window) -> dict[str, float
         subject.policy,
         contexts,
     )
-    inputs = critic_inputs(subject, windows)
+    inputs = inputs_of(subject, windows)
     critics = activations(parts.critics.now, learner.critic_params, inputs, inputs.action)
     numbers = {}
     for network, seen in (("actor", actor), ("critics", critics)):

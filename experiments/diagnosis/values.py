@@ -35,6 +35,7 @@ class Episodes:
       terminated: bool ``[T, E]``.
       done: bool ``[T, E]``: the first episode of each environment ends at the first one.
       bad: bool ``[T, E]`` bad physics.
+      features: ``[T, E, F]`` of the actor's, that critics are to see beside the observation.
     """
 
     obs: jax.Array
@@ -44,6 +45,7 @@ class Episodes:
     terminated: jax.Array
     done: jax.Array
     bad: jax.Array
+    features: jax.Array
 
 
 def make_sampler(env: VectorEnv, parts: SACParts) -> Callable[[PolicyState, jax.Array], Episodes]:
@@ -67,9 +69,13 @@ def make_sampler(env: VectorEnv, parts: SACParts) -> Callable[[PolicyState, jax.
             next_state, taken = env.step(env_state, action)
             acted = Acted(action, outlook.context)
             context = contexts.advance(acted, taken.next_obs, taken.reward, taken.done)
+            features = jnp.zeros((env.num_envs, 0))
+            if parts.num_critic_features:
+                assert outlook.features is not None
+                features = outlook.features
             seen = Episodes(
                 env_state.obs, action, log_prob, taken.reward, taken.terminated, taken.done,
-                taken.bad,
+                taken.bad, features,
             )  # fmt: skip
             return (next_state, context), seen
 
@@ -101,13 +107,18 @@ class Judged:
     entropy: float
 
 
-def make_judge(parts: SACParts, window_length: int) -> Callable[[LearnerState, Any, Any], Any]:
-    """``judge(learner, obs [T, O], action [T, A]) -> [T]``: the smallest Q of each step of an
-    episode, seen as the last one of a window; jitted.
+Judge = Callable[[LearnerState, Any, Any, Any], Any]
+
+
+def make_judge(parts: SACParts, window_length: int) -> Judge:
+    """``judge(learner, obs [T, O], features [T, F], action [T, A]) -> [T]``: the smallest Q of each
+    step of an episode, seen as the last one of a window; jitted.
     """
 
     @jax.jit
-    def judge(learner: LearnerState, obs: jax.Array, action: jax.Array) -> jax.Array:
+    def judge(
+        learner: LearnerState, obs: jax.Array, features: jax.Array, action: jax.Array
+    ) -> jax.Array:
         length = obs.shape[0]
         # [T, W]: the steps of the window that ends at each; before the episode there is nothing.
         place = jnp.arange(length)[:, None] + jnp.arange(1 - window_length, 1)
@@ -116,6 +127,7 @@ def make_judge(parts: SACParts, window_length: int) -> Callable[[LearnerState, A
         obs = jnp.where(real[..., None], obs[place], 0.0)  # [T, W, O]
         action = jnp.where(real[..., None], action[place], 0.0)
         obs = parts.normalized(learner.normalizer, obs)
+        obs = jnp.concatenate([obs, features[place]], axis=-1)
         time_step = jnp.where(real, place, 0)
         inputs = CriticInputs(
             obs=obs,
@@ -133,7 +145,7 @@ def make_judge(parts: SACParts, window_length: int) -> Callable[[LearnerState, A
 def judged(
     learner: LearnerState,
     episodes: Episodes,
-    judge: Callable[[LearnerState, Any, Any], Any],
+    judge: Judge,
     discount: float,
 ) -> Judged:
     """Q and return of the steps of first episodes; those that bad physics ended are left out.
@@ -152,7 +164,7 @@ def judged(
         if np.any(column.bad[:length]):
             continue
         # All steps, so that one program does for episodes of every length.
-        values = np.asarray(judge(learner, column.obs, column.action))
+        values = np.asarray(judge(learner, column.obs, column.features, column.action))
         known = num_known(length, bool(column.terminated[length - 1]), discount)
         soft = soft_returns(column.reward[:length], column.log_prob[:length], discount, alpha)
         q.append(values[:known])

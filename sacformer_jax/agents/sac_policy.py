@@ -147,10 +147,12 @@ class Outlook:
     Attributes:
       gaussian: ``[N, A]``.
       context: the contexts, whose caches now hold that pair too.
+      features: of the trunk, ``[N, D]``; None of an actor without one.
     """
 
     gaussian: GaussianParams
     context: Context
+    features: jax.Array | None
 
 
 def acting_outlook(
@@ -174,8 +176,9 @@ def acting_outlook(
         mutable=["cache"],
     )
     acted, changed = output
-    newest = jax.tree.map(lambda x: x[:, -1], acted.gaussian)
-    return Outlook(newest, dataclasses.replace(context, cache=changed.get("cache", {})))
+    newest, features = jax.tree.map(lambda x: x[:, -1], (acted.gaussian, acted.features))
+    context = dataclasses.replace(context, cache=changed.get("cache", {}))
+    return Outlook(newest, context, features)
 
 
 # --- training --------------------------------------------------------------------------------

@@ -161,7 +161,7 @@ def _after_critics(
 
     outputs, pull_back, both = jax.vjp(policies, learner.actor_params, has_aux=True)
     gaussian, prediction = outputs
-    inputs, weights = _critic_inputs(parts, learner, window, both), step_weights(parts, window)
+    inputs, weights = critic_inputs(parts, learner, window, both), step_weights(parts, window)
     learner, metrics, non_finite = _update_critics(
         parts, learner, hyper, window, inputs, weights, gaussian, both.following, next_noise
     )
@@ -216,9 +216,10 @@ def _alpha(learner: LearnerState) -> jax.Array:
     return jnp.exp(learner.log_alpha)
 
 
-def _critic_inputs(
+def critic_inputs(
     parts: SACParts, learner: LearnerState, window: Window, both: WindowPolicies
 ) -> CriticInputs:
+    """What critics may look at of B windows; ``both`` are the policies over them."""
     obs = parts.normalized(learner.normalizer, window.obs)
     if window.following is None:
         now, following = obs[:, :-1], obs[:, 1:]
