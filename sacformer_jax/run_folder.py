@@ -162,10 +162,7 @@ class RunFolder:
 
     def read_spec(self) -> EnvSpec:
         """Facts of the run's environment, without making it."""
-        values = self._config_json()["env_spec"]
-        for name in ("action_low", "action_high"):
-            values[name] = tuple(values[name])
-        return EnvSpec(**values)
+        return EnvSpec.from_dict(self._config_json()["env_spec"])
 
     # --- checkpoints -----------------------------------------------------------------------------
 

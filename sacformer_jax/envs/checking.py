@@ -11,6 +11,7 @@ import numpy as np
 
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import Env, EnvSpec, EnvStep
+from sacformer_jax.envs.wrapping import are_places
 
 _METHODS = ("reset", "step", "step_and_refill")
 
@@ -98,6 +99,11 @@ class _Check:
                 all(math.isfinite(bound) for bound in bounds),
                 f"spec.{field}={bounds!r}: must be finite, since actions are scaled to the bounds",
             )
+        self.require(
+            are_places(spec.velocities, spec.obs_size),
+            f"spec.velocities={spec.velocities!r}: must be pairs (start, stop) in order, within "
+            f"the {spec.obs_size} observations",
+        )
         self.require(
             all(low < high for low, high in zip(spec.action_low, spec.action_high, strict=True)),
             f"spec.action_low={spec.action_low}: must be below spec.action_high={spec.action_high}",

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.wrapping import UNWRAPPED, Places, Wrapping
 from sacformer_jax.parallel import UNDIVIDED, DataAxis, any_of_all
 
 
@@ -36,6 +37,9 @@ class EnvSpec:
       engine: which physics runs it.
       engine_reason: why that engine.
       gymnasium_id: the same task in Gymnasium, or None.
+      velocities: places of the observation that are velocities, each ``(start, stop)``, in order;
+        empty where nobody said.
+      wrapping: the wrappers around it.
     """
 
     name: str
@@ -47,6 +51,19 @@ class EnvSpec:
     engine: str
     engine_reason: str
     gymnasium_id: str | None = None
+    velocities: Places = ()
+    wrapping: Wrapping = UNWRAPPED
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> EnvSpec:
+        """Inverse of ``dataclasses.asdict``, also after JSON, and of an earlier version."""
+        wrapping = {name: _tuples(value) for name, value in values.get("wrapping", {}).items()}
+        facts = {name: _tuples(value) for name, value in values.items()}
+        return cls(**{**facts, "wrapping": Wrapping(**wrapping)})
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
 
 
 @flax.struct.dataclass

@@ -12,7 +12,14 @@ import numpy as np
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import EnvSpec, EnvStep, where_tree
 from sacformer_jax.envs.physics import EngineChoice, PhysicsOutput, ResetNoise, make_engine
-from sacformer_jax.envs.tasks import TASKS, Coordinates, Derived, RewardTerms, Task
+from sacformer_jax.envs.tasks import (
+    TASKS,
+    Coordinates,
+    Derived,
+    RewardTerms,
+    Task,
+    positions_and_velocities,
+)
 from sacformer_jax.parallel import any_of_all
 
 
@@ -37,6 +44,9 @@ class MujocoEnv:
             raise ConfigError(
                 f"task {task.name!r}: observe gives {obs}: must be a vector [O] of float32"
             )
+        velocities = task.velocities
+        if not velocities and task.observe is positions_and_velocities:
+            velocities = ((self.engine.nq, self.engine.nq + self.engine.nv),)
         self.spec = EnvSpec(
             name=task.name,
             obs_size=obs.shape[0],
@@ -47,6 +57,7 @@ class MujocoEnv:
             engine=choice.engine,
             engine_reason=reason,
             gymnasium_id=task.gymnasium_id,
+            velocities=velocities,
         )
 
     def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:

@@ -60,7 +60,7 @@ RewardTerms = dict[str, jax.Array]
 RewardFunction = Callable[[Quantities, jax.Array, jax.Array], RewardTerms]
 
 
-def _positions_and_velocities(q: Quantities) -> jax.Array:
+def positions_and_velocities(q: Quantities) -> jax.Array:
     return jnp.concatenate([q.qpos, q.qvel])
 
 
@@ -96,12 +96,14 @@ class Task:
         that is fixed to the world.
       max_episode_steps: time limit, in environment steps.
       gymnasium_id: the same task in Gymnasium, e.g. ``"HalfCheetah-v5"``, or None.
+      velocities: places of ``observe``'s vector that are velocities, each ``(start, stop)``, for
+        ``hide_velocities``; of the default ``observe`` they are known.
     """
 
     name: str
     xml_file: str | Path
     reward_terms: RewardFunction
-    observe: Callable[[Quantities], jax.Array] = _positions_and_velocities
+    observe: Callable[[Quantities], jax.Array] = positions_and_velocities
     terminated: Callable[[Quantities], jax.Array] = _never
     frame_skip: int = 1
     measure: Measure = "root"
@@ -113,10 +115,13 @@ class Task:
     recentre_root: bool = False
     max_episode_steps: int = 1000
     gymnasium_id: str | None = None
+    velocities: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
-        # A list would do as well, but engines are found by their task, which must have a hash.
+        # Lists would do as well, but engines are found by their task, which must have a hash.
         object.__setattr__(self, "derived", tuple(self.derived))
+        places = (tuple(place) if isinstance(place, list) else place for place in self.velocities)
+        object.__setattr__(self, "velocities", tuple(places))
 
 
 def _between(low: float, value: jax.Array, high: float) -> jax.Array:
@@ -235,6 +240,7 @@ TASKS: dict[str, Task] = {
             reward_terms=_half_cheetah_reward,
             recentre_root=True,
             gymnasium_id="HalfCheetah-v5",
+            velocities=((8, 17),),
         ),
         Task(
             name="Hopper",
@@ -249,6 +255,7 @@ TASKS: dict[str, Task] = {
             terminated=lambda q: ~_hopper_healthy(q),
             recentre_root=True,
             gymnasium_id="Hopper-v5",
+            velocities=((5, 11),),
         ),
         Task(
             name="Walker2d",
@@ -263,6 +270,7 @@ TASKS: dict[str, Task] = {
             terminated=lambda q: ~_walker2d_healthy(q),
             recentre_root=True,
             gymnasium_id="Walker2d-v5",
+            velocities=((8, 17),),
         ),
         Task(
             name="Ant",
@@ -278,6 +286,7 @@ TASKS: dict[str, Task] = {
             terminated=lambda q: ~_ant_healthy(q),
             recentre_root=True,
             gymnasium_id="Ant-v5",
+            velocities=((13, 27),),
         ),
         Task(
             name="Humanoid",
@@ -293,6 +302,7 @@ TASKS: dict[str, Task] = {
             terminated=lambda q: ~_humanoid_healthy(q),
             recentre_root=True,
             gymnasium_id="Humanoid-v5",
+            velocities=((22, 45), (175, 253)),  # qvel, cvel
         ),
     )
 }
