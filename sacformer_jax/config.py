@@ -55,6 +55,12 @@ class TaskConfig:
     max_episode_steps: int = 1000
     """Time limit of an episode, in environment steps (truncation, not termination); by default of
     gym:ID, playground:NAME and your own tasks theirs."""
+    hide_velocities: bool = False
+    """Leave the velocities out of the observation."""
+    action_delay: int = 0
+    """Steps between choosing an action and its effect; until then it is 0."""
+    stack_obs: int = 1
+    """Observations seen as one, with the actions between them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from sacformer_jax import agents
 from sacformer_jax.agents.core import Agent, Metrics
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.config import Config
-from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.envs import VectorEnv, make_env, wrapped
 from sacformer_jax.iteration import TrainingFunctions, policy_of, policy_state
 from sacformer_jax.on_policy import RolloutLearning
 from sacformer_jax.parallel import UNDIVIDED, DataAxis
@@ -95,7 +95,9 @@ class Program:
 def make_training_env(
     config: Config, num_envs: int | None = None, data: DataAxis = UNDIVIDED
 ) -> VectorEnv:
-    """The configuration's environment, vectorized; ``num_envs`` other than its own if given."""
+    """The configuration's environment with its wrappers, vectorized; ``num_envs`` other than its
+    own if given.
+    """
     task = config.task
     env = make_env(
         task.env,
@@ -105,6 +107,7 @@ def make_training_env(
         task.mjx_impl,
         task.max_episode_steps,
     )
+    env = wrapped(env, task.hide_velocities, task.action_delay, task.stack_obs)
     num_envs = task.num_envs if num_envs is None else num_envs
     return VectorEnv(env, num_envs, task.max_episode_steps, data)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from sacformer_jax.config import MLP_AGENTS, Config, ConfigError, shortest_column
+from sacformer_jax.config import MLP_AGENTS, Config, ConfigError, TaskConfig, shortest_column
 
 _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
     "checkpoint_every", "chunk_env_steps", "buffer_capacity", "batch_size", "context_length",
     "actor_layers", "actor_width", "actor_heads", "actor_mlp_ratio", "critic_layers",
     "critic_width", "critic_heads", "critic_history", "policy_delay", "rollout_steps", "epochs",
-    "minibatches",
+    "minibatches", "stack_obs",
 )  # fmt: skip
 _POSITIVE = (
     "updates_per_env_step", "return_scale", "head_init_scale", "actor_learning_rate",
@@ -47,9 +47,10 @@ def check(config: Config) -> None:
         "discount", "rtg_discount", "prefill_env_steps", "seed", "action_noise",
         "max_skipped_updates", "gae_lambda", "target_noise", "entropy_coefficient",
         "value_coefficient", "pretrain_updates", "video_every", "burn_in", "state_path_width",
-        "td_lambda", "prediction_weight",
+        "td_lambda", "prediction_weight", "action_delay",
     ):  # fmt: skip
         _require(values[name] >= 0, f"{name}={values[name]}: must not be negative")
+    _check_wrappers(config)
     _check_seeds(config)
     _check_actor(config)
     _check_policy(config)
@@ -63,6 +64,16 @@ def check(config: Config) -> None:
         _check_ppo(config)
     else:
         _check_steps(config)
+
+
+def _check_wrappers(config: Config) -> None:
+    task = config.task
+    for name in ("action_delay", "stack_obs"):
+        value = getattr(task, name)
+        _require(
+            value < task.max_episode_steps or value == getattr(TaskConfig, name),
+            f"{name}={value}: must be below max_episode_steps={task.max_episode_steps}",
+        )
 
 
 def _check_seeds(config: Config) -> None:
@@ -337,6 +348,13 @@ def _check_offline(config: Config) -> None:
         f"dataset={offline.dataset!r}: is in the replay, which checkpoint_replay=False does not "
         "save; use checkpoint_replay=True",
     )
+    for name in ("hide_velocities", "action_delay", "stack_obs"):
+        value, plain = getattr(config.task, name), getattr(TaskConfig, name)
+        _require(
+            value == plain,
+            f"dataset={offline.dataset!r}: its steps are the environment's own, not those under "
+            f"{name}={value}; use {name}={plain}, or dataset=''",
+        )
 
 
 def _check_steps(config: Config) -> None:

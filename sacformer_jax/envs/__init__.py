@@ -20,6 +20,8 @@ from sacformer_jax.envs.mujoco_env import MujocoEnv
 from sacformer_jax.envs.own import as_env, own_env, register_env
 from sacformer_jax.envs.physics import ENGINES, EngineChoice
 from sacformer_jax.envs.tasks import TASKS, Coordinates, Quantities, Task
+from sacformer_jax.envs.wrappers import ActionDelay, HiddenVelocities, StackedObs, Wrapper, wrapped
+from sacformer_jax.envs.wrapping import Wrapping
 from sacformer_jax.presets import TASK_LAYERS, Layer
 
 if TYPE_CHECKING:
@@ -30,22 +32,28 @@ BRAX_PREFIX, GYM_PREFIX, PLAYGROUND_PREFIX = "brax:", "gym:", "playground:"
 __all__ = [
     "ENGINES",
     "TASKS",
+    "ActionDelay",
     "Coordinates",
     "EngineChoice",
     "Env",
     "EnvSpec",
     "EnvStep",
+    "HiddenVelocities",
     "JaxEnv",
     "MujocoEnv",
     "Quantities",
+    "StackedObs",
     "Task",
     "VectorEnv",
     "VectorEnvState",
     "VectorStep",
+    "Wrapper",
+    "Wrapping",
     "as_brax",
     "check_env",
     "make_env",
     "register_env",
+    "wrapped",
 ]
 
 
