@@ -7,7 +7,7 @@ import argparse
 import gymnasium
 
 from sacformer_jax import Policy, load_policy
-from sacformer_jax.gymnasium_eval import gymnasium_id
+from sacformer_jax.gymnasium_eval import gymnasium_env
 
 
 def play(policy: Policy, env: gymnasium.Env, episodes: int, seed: int = 0) -> list[float]:
@@ -32,5 +32,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=3)
     args = parser.parse_args()
     trained = load_policy(args.run)
-    for value in play(trained, gymnasium.make(gymnasium_id(trained)), args.episodes):
+    for value in play(trained, gymnasium_env(trained), args.episodes):
         print(f"return {value:.1f}")

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax import Policy, load_policy
-from sacformer_jax.gymnasium_eval import gymnasium_id
+from sacformer_jax.gymnasium_eval import gymnasium_env
 
 
 def play(
@@ -42,6 +42,7 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=2, help="of each environment")
     args = parser.parse_args()
     trained = load_policy(args.run)
-    vector_env = gymnasium.make_vec(gymnasium_id(trained), num_envs=args.num_envs)
+    makers = [lambda: gymnasium_env(trained)] * args.num_envs
+    vector_env = gymnasium.vector.SyncVectorEnv(makers)
     for number, values in enumerate(play(trained, vector_env, args.episodes)):
         print(f"environment {number}: returns {', '.join(f'{value:.1f}' for value in values)}")

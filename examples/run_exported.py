@@ -34,6 +34,8 @@ if __name__ == "__main__":
     import gymnasium
 
     step, state, manifest = load(sys.argv[1])
+    if wrappers := manifest.get("wrappers"):
+        raise SystemExit(f"it needs an environment wrapped as in its training: {wrappers}")
     env = gymnasium.make(manifest["gymnasium_id"])
     obs, _ = env.reset(seed=0)
     reward, total, start, done = 0.0, 0.0, True, False

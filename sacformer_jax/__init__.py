@@ -5,7 +5,8 @@ For runs: :class:`Config`, :func:`train`, :func:`resume`, :func:`evaluate`, :fun
 :class:`Member` and :class:`Devices` of many members on many devices, and :class:`Callback` for your
 own code between chunks.
 For environments of your own: :class:`Task`, :class:`MujocoEnv`, :class:`JaxEnv`,
-:func:`check_env`, :func:`register_env`; for ``brax.training`` on ours: :func:`as_brax`.
+:func:`check_env`, :func:`register_env`; with wrappers: :func:`wrapped`, and in Gymnasium
+:func:`gymnasium_env`; for ``brax.training`` on ours: :func:`as_brax`.
 For your own loops: :func:`make_env`, :class:`VectorEnv`, :func:`make_program` (``init``,
 ``prefill``, ``train_chunk``), :func:`make_evaluator`, :func:`policy_of`.
 """
@@ -28,10 +29,12 @@ from sacformer_jax.envs import (
     check_env,
     make_env,
     register_env,
+    wrapped,
 )
 from sacformer_jax.evaluate import make_evaluator
 from sacformer_jax.export import export_policy
 from sacformer_jax.extraction import extract
+from sacformer_jax.gymnasium_eval import gymnasium_env
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.members import Member, seed_members
 from sacformer_jax.policy import Policy, load_policy
@@ -76,6 +79,7 @@ __all__ = [
     "evaluate",
     "export_policy",
     "extract",
+    "gymnasium_env",
     "load_policy",
     "make_env",
     "make_evaluator",
@@ -88,4 +92,5 @@ __all__ = [
     "resume",
     "seed_members",
     "train",
+    "wrapped",
 ]

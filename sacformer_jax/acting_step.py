@@ -140,6 +140,7 @@ def manifest(step: ActingStep, num_envs: int | None, deterministic: bool) -> dic
         "agent": policy.config.agent,
         "env": spec.name,
         "gymnasium_id": spec.gymnasium_id,
+        "wrappers": dataclasses.asdict(spec.wrapping) if spec.wrapping.words() else None,
         "deterministic": deterministic,
         "uses_reward": policy.uses_reward,
         "action_low": list(spec.action_low),

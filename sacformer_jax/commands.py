@@ -134,7 +134,8 @@ def evaluate(args: list[str]) -> int:
     if parsed.json:
         return 0
     if parsed.gymnasium:
-        baseline = evaluate_random(record["env"], parsed.episodes, parsed.seed)
+        wrapping = RunFolder(parsed.run).read_spec().wrapping
+        baseline = evaluate_random(record["env"], parsed.episodes, parsed.seed, wrapping)
         rows["random actions"] = baseline.record()
     print(f"{record['env']}, {parsed.episodes} episodes")
     width = max(15, *(len(name) for name in rows))
@@ -149,6 +150,7 @@ def evaluate(args: list[str]) -> int:
 def collect(args: list[str]) -> int:
     """``sacformer collect``."""
     from sacformer_jax import api
+    from sacformer_jax.checkpoint import RunFolder
 
     parsed = tyro.cli(CollectArgs, args=args, prog="sacformer collect")
     path = api.collect(
@@ -160,7 +162,11 @@ def collect(args: list[str]) -> int:
         seed=parsed.seed,
         member=parsed.member,
     )
-    print(f"written to {path}; start from it with: sacformer train --dataset {parsed.to}")
+    wrapped = RunFolder(parsed.run).read_spec().wrapping.words()
+    use = f"holds what the wrappers show ({', '.join(wrapped)})"
+    if not wrapped:
+        use = f"start from it with: sacformer train --dataset {parsed.to}"
+    print(f"written to {path}; {use}")
     return 0
 
 

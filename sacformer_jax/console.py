@@ -90,6 +90,8 @@ class Reporter:
             f"task         {spec.name}: {spec.obs_size} observations, {spec.action_size} actions, "
             f"{config.task.num_envs} environments"
         )
+        if spec.wrapping.words():
+            self.say(f"wrappers     {', '.join(spec.wrapping.words())}")
         self.say(f"engine       {spec.engine} ({spec.engine_reason})")
         who = f"seed {members[0].seed}"
         if len(members) > 1:

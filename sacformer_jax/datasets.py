@@ -13,6 +13,7 @@ import numpy as np
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.envs.gym_registry import registered
+from sacformer_jax.envs.gym_wrappers import gym_wrapped_spec
 from sacformer_jax.offline import Episode
 
 
@@ -167,4 +168,4 @@ def _env_spec(spec: EnvSpec) -> Any:
     if spec.gymnasium_id is None:
         return None
     found = registered(spec.gymnasium_id)
-    return None if callable(found.entry_point) else found
+    return None if callable(found.entry_point) else gym_wrapped_spec(found, spec.wrapping)

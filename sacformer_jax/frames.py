@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs import Env, MujocoEnv
+from sacformer_jax.envs import Env, MujocoEnv, Wrapper
 from sacformer_jax.model_renderer import ModelRenderer, View
 
 
@@ -48,6 +48,8 @@ def frame_source(env: Env, view: View) -> FrameSource:
     from sacformer_jax.envs.gym_env import GymEnv
     from sacformer_jax.envs.playground_env import PlaygroundEnv
 
+    if isinstance(env, Wrapper):
+        return WrappedFrames(frame_source(env.env, view))
     for candidate in (env, getattr(env, "brax", None)):
         own = getattr(candidate, "frame_source", None)
         if own is not None:
@@ -97,6 +99,31 @@ class EngineFrames:
 
     def close(self) -> None:
         self._renderer.close()
+
+
+class WrappedFrames:
+    """A wrapped environment, drawn as what is within.
+
+    Args:
+      source: who draws that.
+    """
+
+    def __init__(self, source: FrameSource):
+        self.source, self.dt = source, source.dt
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "source":
+            raise AttributeError(name)
+        return getattr(self.source, name)  # brax's page
+
+    def snapshot(self, state: Any) -> Any:
+        return self.source.snapshot(state.env)
+
+    def draw(self, snapshot: Any) -> np.ndarray:
+        return self.source.draw(snapshot)
+
+    def close(self) -> None:
+        self.source.close()
 
 
 class BraxFrames:

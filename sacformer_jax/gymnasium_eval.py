@@ -11,7 +11,9 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.gym_wrappers import gym_wrapped
 from sacformer_jax.envs.models import loading_quietly
+from sacformer_jax.envs.wrapping import UNWRAPPED, Wrapping
 from sacformer_jax.policy import Policy
 
 
@@ -44,7 +46,7 @@ class GymnasiumEvaluation:
 
 
 def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
-    """Runs a policy's mean actions in the Gymnasium task it was trained on.
+    """Runs a policy's mean actions in the Gymnasium task it was trained on, wrapped as there.
 
     Args:
       policy: the policy.
@@ -58,15 +60,18 @@ def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEv
     def predict(obs: Any, state: Any, reward: float | None) -> tuple[np.ndarray, Any]:
         return policy.predict(obs, state, reward=reward)
 
-    return _run(gymnasium_id(policy), episodes, seed, predict)
+    env_id, wrapping = gymnasium_id(policy), policy.spec.wrapping
+    return _run(env_id, wrapping, episodes, seed, predict)
 
 
-def evaluate_random(env_id: str, episodes: int, seed: int = 0) -> GymnasiumEvaluation:
+def evaluate_random(
+    env_id: str, episodes: int, seed: int = 0, wrapping: Wrapping = UNWRAPPED
+) -> GymnasiumEvaluation:
     """The same with uniformly random actions."""
-    with loading_quietly(), contextlib.closing(gymnasium.make(env_id)) as env:
+    with contextlib.closing(_made(env_id, wrapping)) as env:
         space = env.action_space
     space.seed(seed)
-    return _run(env_id, episodes, seed, lambda obs, state, reward: (space.sample(), None))
+    return _run(env_id, wrapping, episodes, seed, lambda obs, state, reward: (space.sample(), None))
 
 
 def gymnasium_id(policy: Policy) -> str:
@@ -82,16 +87,34 @@ def gymnasium_id(policy: Policy) -> str:
     return policy.spec.gymnasium_id
 
 
+def gymnasium_env(policy: Policy, **settings: Any) -> gymnasium.Env:
+    """The Gymnasium environment that a policy acts in: its task, with the wrappers of training.
+
+    Args:
+      policy: the policy.
+      **settings: for ``gymnasium.make``, e.g. ``render_mode="human"``.
+
+    Raises:
+      ConfigError: its task is none of Gymnasium's.
+    """
+    return _made(gymnasium_id(policy), policy.spec.wrapping, **settings)
+
+
+def _made(env_id: str, wrapping: Wrapping, **settings: Any) -> gymnasium.Env:
+    with loading_quietly():
+        return gym_wrapped(gymnasium.make(env_id, **settings), wrapping)
+
+
 def _run(
     env_id: str,
+    wrapping: Wrapping,
     episodes: int,
     seed: int,
     predict: Callable[[Any, Any, float | None], tuple[np.ndarray, Any]],
 ) -> GymnasiumEvaluation:
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
-    with loading_quietly():
-        env = gymnasium.make(env_id)
+    env = _made(env_id, wrapping)
     returns, lengths = np.zeros(episodes), np.zeros(episodes, int)
     terms: dict[str, float] = {}
     for episode in range(episodes):

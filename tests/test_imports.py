@@ -85,6 +85,7 @@ ALLOWED = {
     "envs.gym_host": {"gymnasium", "threading", "warnings"},  # the environments are Gymnasium's
     "envs.gym_live": {"gymnasium"},
     "envs.gym_registry": {"gymnasium", "importlib"},
+    "envs.gym_wrappers": {"gymnasium"},
     "env_names": {"importlib", "os", "sys"},  # finds the user's module
     "envs.native_host": {"threading", "concurrent"},  # the host's side of the callback
     "envs.physics": {"pathlib", "importlib"},  # finds the model files

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from sacformer_jax import Config, agents, make_env
+from sacformer_jax import Config, agents, make_env, wrapped
 from sacformer_jax.checkpoint import BestSoFar, RunFolder, save_best
 from sacformer_jax.members import Member
 from sacformer_jax.runner import sources_of
@@ -34,7 +34,8 @@ def untrained_run(path: Path, seeds: int = 1, **fields: object) -> Path:
     """A run of so many members with a best policy, and metrics made up."""
     config = untrained_config(seeds=seeds, **fields)
     task = config.task
-    spec = make_env(task.env, task.engine, task.brax_backend).spec
+    env = make_env(task.env, task.engine, task.brax_backend)
+    spec = wrapped(env, task.hide_velocities, task.action_delay, task.stack_obs).spec
     members = tuple(Member(f"seed-{seed}", seed) for seed in range(seeds))
     folder = RunFolder(path)
     folder.create(config, sources_of(config), spec, members)

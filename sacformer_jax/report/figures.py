@@ -30,7 +30,7 @@ def returns_figure(runs: Sequence[Run]) -> str | None:
       SVG; None where no run was evaluated.
     """
     curves = [run.curve() for run in runs]
-    tasks = list(dict.fromkeys(run.config.task.env for run in runs))
+    tasks = list(dict.fromkeys(run.task for run in runs))
     if all(curve is None for curve in curves):
         return None
     styles = [line_style(place, len(runs)) for place in range(len(runs))]
@@ -39,7 +39,7 @@ def returns_figure(runs: Sequence[Run]) -> str | None:
         panels = figure.subplots(len(tasks), 2, squeeze=False)
         for (left, right), task in zip(panels, tasks, strict=True):
             for place, (run, curve) in enumerate(zip(runs, curves, strict=True)):
-                if curve is None or run.config.task.env != task:
+                if curve is None or run.task != task:
                     continue
                 _draw_curve(left, curve, curve.env_steps, styles[place], run.label)
                 minutes = _minutes(run, curve)

@@ -82,7 +82,7 @@ def _run_row(run: Run) -> list[str]:
     seconds = f"{run.training_seconds[-1] / 60:,.1f} min" if run.timings else "–"
     started = {0: "–", 1: "once"}.get(run.stretches, f"{run.stretches} times")
     return [
-        run.label, run.config.agent, run.config.task.env, run.engine, run.config.preset,
+        run.label, run.config.agent, run.task, run.engine, run.config.preset,
         str(len(run.evaluations)), done, last, best, speed, seconds, started,
         str(run.faults.total),
     ]  # fmt: skip

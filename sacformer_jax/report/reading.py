@@ -70,6 +70,7 @@ class Run:
       path: its folder.
       config: the configuration.
       sources: where each value comes from.
+      task: the environment, and how it is wrapped.
       engine: which physics ran it.
       train: by member, the records of kind ``"train"``.
       evaluations: by member, those of kind ``"eval"``.
@@ -82,6 +83,7 @@ class Run:
     path: Path
     config: Config
     sources: dict[str, str]
+    task: str
     engine: str
     train: dict[str, list[Record]]
     evaluations: dict[str, list[Record]]
@@ -174,6 +176,7 @@ def read_run(path: str | Path, label: str) -> Run:
         path=folder.path,
         config=known.config,
         sources=known.sources,
+        task=", ".join([known.config.task.env, *spec.wrapping.words()]),
         engine=spec.engine,
         train=by_kind["train"],
         evaluations=by_kind["eval"],
