@@ -242,14 +242,32 @@ def main_of_scales(study_at: Callable[[str], Study], arguments: Sequence[str] | 
       study_at: makes the study at a scale, one of ``SCALES``.
       arguments: instead of those of the process.
     """
+    text = "cpu (default): small networks and few steps; full: those of the paper"
+    return main_of_choices(study_at, "scale", SCALES, text, arguments)
+
+
+def main_of_choices(
+    study_at: Callable[[str], Study],
+    name: str,
+    choices: Sequence[str],
+    text: str,
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """The command line of studies that differ in one choice: :meth:`Study.main` and its flag.
+
+    Args:
+      study_at: makes the study of a choice.
+      name: of the flag, without dashes.
+      choices: the first is the default.
+      text: the flag's help.
+      arguments: instead of those of the process.
+    """
+    flag = f"--{name}"
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument(
-        "--scale", choices=SCALES, default=SCALES[0],
-        help="cpu (default): small networks and few steps; full: those of the paper",
-    )  # fmt: skip
-    scale = parser.parse_known_args(arguments)[0].scale
-    study = study_at(scale)
-    study.flags = ("--scale", scale)
+    parser.add_argument(flag, dest="choice", choices=choices, default=choices[0], help=text)
+    choice = parser.parse_known_args(arguments)[0].choice
+    study = study_at(choice)
+    study.flags = (flag, choice)
     return study.main(arguments, [parser])
 
 

@@ -1,0 +1,60 @@
+"""Where a state does not tell all: how SACFormer is to see the past, beside SAC that sees it too.
+
+python experiments/memory.py --jobs 2                 # velocities left out of the observation
+python experiments/memory.py --arena delay --jobs 2   # actions come into effect two steps late
+
+Preset `cpu`, 60,000 env steps, seeds 0 to 2 in one program. SAC sees the last K observations with
+the actions between them; SACFormer the same history, as K pairs with its own actions among them.
+Return-to-go tells of the reward and so of the velocity: none of these has it, but one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from typing import Any
+
+from study import Study, main_of_choices
+
+from sacformer_jax import Config
+
+TASKS = ("Hopper", "Walker2d", "HalfCheetah")
+ENV_STEPS, SEEDS = 60_000, 3
+K = 6
+"""Of preset `cpu`."""
+ARENAS: dict[str, dict[str, Any]] = {
+    "hidden": {"hide_velocities": True},
+    "delay": {"action_delay": 2},
+}
+_SEQUENCE: dict[str, Any] = {"tokens": "gsa", "return_conditioning": "none"}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "sac": {"agent": "sac", "stack_obs": K},
+    "sac-one-state": {"agent": "sac"},
+    # Critics that see no more than the current state.
+    "blind-critic": _SEQUENCE,
+    "critic-features": {**_SEQUENCE, "critic_features": True},
+    "predicting-features": {**_SEQUENCE, "critic_features": True, "prediction_weight": 1.0},
+    # Every step is learnt from with all the past that acting shows.
+    "critic-history": {
+        **_SEQUENCE, "critic_history": K, "burn_in": K - 1, "acting_context": "episode",
+        "acting_context_limit": K,
+    },
+    "with-return": {
+        "tokens": "gsa", "critic_features": True, "prediction_weight": 1.0,
+    },
+}  # fmt: skip
+
+
+def study(arena: str) -> Study:
+    """All its runs."""
+    configs = {
+        f"{task}-{variant}": Config.from_preset(
+            "cpu", env=task, seeds=SEEDS, total_env_steps=ENV_STEPS, **ARENAS[arena], **changes
+        )
+        for (variant, changes), task in itertools.product(VARIANTS.items(), TASKS)
+    }
+    return Study(f"memory-{arena}", configs, __file__)
+
+
+if __name__ == "__main__":
+    sys.exit(main_of_choices(study, "arena", tuple(ARENAS), "what is kept from the agent"))
