@@ -189,6 +189,25 @@ def test_every_study_can_be_trained_as_it_is(name: str, scale: str) -> None:
         assert config.preset == {"cpu": "cpu", "full": "paper"}[scale]
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments"), [("improve", ()), ("memory", ("hidden",)), ("memory", ("delay",))]
+)
+def test_the_agents_are_compared_on_the_same_task(name: str, arguments: tuple[str, ...]) -> None:
+    """In studies of what makes SACFormer better: the same steps, updates, seeds, evaluations."""
+    study = importlib.import_module(name).study(*arguments)
+    assert study.name == "-".join([name, *arguments])
+    same = (
+        "preset", "seeds", "total_env_steps", "prefill_env_steps", "updates_per_env_step",
+        "num_envs", "eval_every", "eval_episodes", "hide_velocities", "action_delay",
+    )  # fmt: skip
+    for field in same:
+        assert len({config.flat()[field] for config in study.configs.values()}) == 1, field
+    for run, config in study.configs.items():
+        config.validated()
+        assert run.startswith(f"{config.task.env}-")
+    assert {config.agent for config in study.configs.values()} == {"sacformer", "sac"}
+
+
 def test_the_studies_are_those_of_the_paper() -> None:
     runs = {name: set(importlib.import_module(name).study("full").configs) for name in SCRIPTS}
     agents, tasks = (
