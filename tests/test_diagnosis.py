@@ -178,7 +178,7 @@ def test_percentiles_and_the_share_outside() -> None:
 # --- gradients -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("agent", ["sacformer", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("agent", ["sac", pytest.param("sacformer", marks=pytest.mark.slow)])
 def test_gradients_are_those_of_the_update(agent: str, request: pytest.FixtureRequest) -> None:
     subject: Subject = request.getfixturevalue(agent)
     state, key = subject.state, jax.random.key(3)
@@ -475,7 +475,15 @@ def test_the_script_on_trained_runs_of_both_agents(tmp_path: Path) -> None:
     }  # fmt: skip
     paths = []
     for agent, fields in (
-        ("sacformer", {"actor_layers": 1, "actor_heads": 1, "acting_context": "episode"}),
+        (
+            "sacformer",
+            {
+                "actor_layers": 1,
+                "actor_heads": 1,
+                "acting_context": "episode",
+                "critic_features": True,
+            },
+        ),
         ("sac", {"seeds": 2}),
     ):
         paths.append(str(tmp_path / agent))

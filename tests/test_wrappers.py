@@ -358,7 +358,7 @@ def test_the_training_program_has_the_wrapped_sizes(agent: str) -> None:
     assert after.env.obs.shape == (2, 21)
 
 
-@pytest.mark.parametrize("agent", ["sac", "sacformer"])
+@pytest.mark.parametrize("agent", ["sac", pytest.param("sacformer", marks=pytest.mark.slow)])
 def test_evaluation_in_gymnasium_wraps_it(
     agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
