@@ -27,6 +27,8 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "sacformer": {},
     "no-return": {"return_conditioning": "none"},
     "state-path": {"state_path_width": 256},
+    "no-time": {"time_embedding": "none"},
+    "rotary": {"time_embedding": "rotary"},
     "td-lambda": {"td_lambda": 0.5},
     "critic-norm": {"critic_layer_norm": True},
     "critic-features": {"critic_features": True},

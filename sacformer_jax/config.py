@@ -29,6 +29,7 @@ WindowKind = Literal["contiguous", "scattered"]
 PolicyKind = Literal["gaussian", "deterministic"]
 KernelInit = Literal["lecun", "xavier"]
 CriticName = Literal["mlp", "transformer"]
+TimeEmbedding = Literal["absolute", "rotary", "none"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
 
@@ -167,6 +168,9 @@ class ActorConfig:
     """Leave dropout on in acting and in evaluation (sacformer)."""
     actor_activation: Activation = "relu"
     """Activation function."""
+    time_embedding: TimeEmbedding = "absolute"
+    """How tokens tell their time step: by an embedding of it, by how queries and keys are turned,
+    so that only its difference counts, or not at all (sacformer)."""
     state_path_width: int = 0
     """Width of an MLP of two layers from the newest state to the heads, around the transformer,
     whose part starts at zero; 0: none (sacformer)."""

@@ -21,6 +21,8 @@ import jax.numpy as jnp
 EPSILON = 1e-5
 """Added to the variance in LayerNorm."""
 _MASKED = -1e9
+_ROTARY_BASE = 10_000.0
+"""Of the longest wavelength, 2π times it (RoFormer's)."""
 _BYTE = 256
 
 Initializer = Callable[..., jax.Array]
@@ -193,6 +195,23 @@ def _attend_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array |
 
 
 attend.defvjp(_attend_forward, _attend_backward)
+
+
+def rotated(x: jax.Array, time: jax.Array) -> jax.Array:
+    """Turns pairs of numbers of each head by angles that grow with the token's time (RoFormer, Su
+    et al., arXiv 2104.09864): the product of a query and a key then depends on the difference of
+    their times alone. Entry i is paired with entry i + E/2.
+
+    Args:
+      x: queries or keys, ``[B, H, T, E]``, E even.
+      time: ``[B, T]``.
+    """
+    half = x.shape[-1] // 2
+    frequency = _ROTARY_BASE ** (-jnp.arange(half) / half)
+    angle = time[:, None, :, None] * frequency  # [B, 1, T, E/2]
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    a, b = jnp.split(x.astype(jnp.float32), 2, axis=-1)
+    return jnp.concatenate([a * cos - b * sin, a * sin + b * cos], axis=-1).astype(x.dtype)
 
 
 # --- dropout ---------------------------------------------------------------------------------

@@ -92,7 +92,7 @@ class GaussianHeads(nn.Module):
 
 
 def embed_steps(
-    step: dict[str, jax.Array], time_step: jax.Array, width: int, max_time_step: int
+    step: dict[str, jax.Array], time_step: jax.Array, width: int, max_time_step: int | None
 ) -> jax.Array:
     """The tokens of T steps, interleaved; to be called inside a compact module, whose layers
     ``embed_NAME``, ``embed_time`` and ``ln_embed`` it makes.
@@ -101,15 +101,17 @@ def embed_steps(
       step: what each of a step's n tokens stands for, by name and in order: ``[B, T, ...]``.
       time_step: int32 ``[B, T]``; its embedding is added to all tokens of the step.
       width: D.
-      max_time_step: size of the time-step embedding.
+      max_time_step: size of the time-step embedding; None: nothing is added.
 
     Returns:
       ``[B, nT, D]``.
     """
     batch = time_step.shape[0]
-    time = nn.Embed(
-        max_time_step, width, embedding_init=nn.initializers.normal(0.02), name="embed_time"
-    )(jnp.clip(time_step, 0, max_time_step - 1))
+    time: jax.Array | float = 0.0
+    if max_time_step is not None:
+        time = nn.Embed(
+            max_time_step, width, embedding_init=nn.initializers.normal(0.02), name="embed_time"
+        )(jnp.clip(time_step, 0, max_time_step - 1))
     xavier = nn.initializers.xavier_uniform()
     tokens = [
         Dense(width, xavier, name=f"embed_{name}")(values) + time for name, values in step.items()
@@ -128,7 +130,8 @@ class TransformerActor(nn.Module):
       tokens: ``"gs"`` or ``"gsa"``.
       action_size: A.
       context_length: K; no position attends to more than K pairs.
-      max_time_step: size of the time-step embedding.
+      max_time_step: size of the time-step embedding; None: tokens have none, and know of their time
+        what ``config.rotary`` tells them.
       head_init_scale: see :class:`GaussianHeads`.
       state_path: widths of an MLP on the state alone, whose features go to the heads, those of the
         trunk added to them by a layer that starts at zero: the policy starts as SAC's, and learns
@@ -141,7 +144,7 @@ class TransformerActor(nn.Module):
     config: TransformerConfig
     action_size: int
     context_length: int
-    max_time_step: int
+    max_time_step: int | None
     head_init_scale: float
     tokens: Tokens = "gs"
     state_path: Sequence[int] | None = None
@@ -225,7 +228,8 @@ class TransformerActor(nn.Module):
         # State tokens are the second ones.
         trunk = Transformer(self.config, kept=(1, n), name="trunk")
         newest = token_mask[:, -n * states :]  # all of them, but for those of the past
-        return trunk(tokens, newest, deterministic, past=past)
+        time = jnp.repeat(time_step, n, axis=1)  # [B, nT]
+        return trunk(tokens, newest, deterministic, past=past, time=time)
 
     def _newest_features(
         self, step: dict[str, jax.Array], time_step: jax.Array, deterministic: bool
@@ -234,12 +238,15 @@ class TransformerActor(nn.Module):
         n = len(step)
         # What is new since the last call: the action taken then (if seen), return and state.
         step = {name: values[:, 1 - n :] for name, values in step.items()}
-        tokens = embed_steps(step, time_step[:, 1 - n :], self.config.width, self.max_time_step)
+        steps = time_step[:, 1 - n :]
+        tokens = embed_steps(step, steps, self.config.width, self.max_time_step)
         places = cache_places(time_step[:, -1], n, self.context_length)
         # With actions: (G, S, [A, G, S], A); without: ([G, S]).
-        new_tokens = tokens[:, n * (n - 2) + 2 - n :][:, :n]  # [B, n, D]
+        first = n * (n - 2) + 2 - n
+        new_tokens = tokens[:, first:][:, :n]  # [B, n, D]
+        time = jnp.repeat(steps, n, axis=1)[:, first:][:, :n]  # [B, n]
         trunk = Transformer(self.config, kept=(n - 1, n), name="trunk")
-        return trunk(new_tokens, places.mask, deterministic, places.positions)
+        return trunk(new_tokens, places.mask, deterministic, places.positions, time=time)
 
 
 class MLP(nn.Module):

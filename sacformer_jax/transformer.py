@@ -13,7 +13,14 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend, attention_weights
+from sacformer_jax.layers import (
+    Dense,
+    Dropout,
+    LayerNorm,
+    attend,
+    attention_weights,
+    rotated,
+)
 
 ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
 EVERY_TOKEN = (0, 1)
@@ -31,6 +38,8 @@ class TransformerConfig:
       dropout: rate on embeddings, attention weights and both residual branches.
       activation: one of :data:`ACTIVATIONS`.
       dtype: of the products; parameters, LayerNorm, softmax and the residual stream stay float32.
+      rotary: queries and keys are turned by the time of their tokens (see
+        :func:`~sacformer_jax.layers.rotated`), so that only differences of times count.
     """
 
     layers: int
@@ -40,6 +49,7 @@ class TransformerConfig:
     dropout: float
     activation: str
     dtype: str = "float32"
+    rotary: bool = False
 
 
 @flax.struct.dataclass
@@ -77,6 +87,7 @@ class Block(nn.Module):
         dropout: Dropout,
         positions: jax.Array | None = None,
         past: KeysValues | None = None,
+        time: jax.Array | None = None,
     ) -> tuple[jax.Array, KeysValues]:
         """``x [B, T, D]`` -> ``[B, S, D]`` and its keys and values; see :class:`Transformer`."""
         cfg = self.config
@@ -99,7 +110,12 @@ class Block(nn.Module):
         def split_heads(y: jax.Array) -> jax.Array:
             return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
 
-        seen = KeysValues(split_heads(k), split_heads(v))
+        q, k, v = split_heads(q), split_heads(k), split_heads(v)
+        if cfg.rotary:
+            assert time is not None
+            first, step = self.kept
+            q, k = rotated(q, time[:, first::step]), rotated(k, time)
+        seen = KeysValues(k, v)
         if positions is not None:
             seen = KeysValues(
                 self._cached("key", seen.key, positions, mask.shape[-1]),  # [B, H, C, D/H]
@@ -107,7 +123,6 @@ class Block(nn.Module):
             )
         every = seen if past is None else past.followed_by(seen)
         factors = dropout.factors((batch, cfg.heads, *mask.shape[1:]))
-        q = split_heads(q)
         if self.is_mutable_collection("intermediates"):  # for who asks; training does not
             self.sow("intermediates", "attention", attention_weights(q, every.key, mask))
         mixed = attend(q, every.key, every.value, mask, factors)
@@ -147,6 +162,7 @@ class Transformer(nn.Module):
         deterministic: bool = True,
         positions: jax.Array | None = None,
         past: Seen | None = None,
+        time: jax.Array | None = None,
     ) -> tuple[jax.Array, Seen]:
         """Runs the trunk, on whole sequences or on the newest tokens of longer ones.
 
@@ -159,6 +175,7 @@ class Transformer(nn.Module):
             collection ``"cache"``, which must be mutable; queries then attend to the C places of
             the cache instead of to ``x``. None: no cache.
           past: what the P tokens before these left; they are attended to, too.
+          time: ``[B, T]``, when each token was; needed where ``config.rotary``.
 
         Returns:
           ``[B, S, D]``, the kept tokens, and what a later call may take as its past.
@@ -173,7 +190,8 @@ class Transformer(nn.Module):
         for i in range(cfg.layers):
             kept = self.kept if i == cfg.layers - 1 else EVERY_TOKEN
             before = None if past is None else past[i]
-            x, block_seen = Block(cfg, kept, name=f"block_{i}")(x, mask, dropout, positions, before)
+            block = Block(cfg, kept, name=f"block_{i}")
+            x, block_seen = block(x, mask, dropout, positions, before, time)
             seen.append(block_seen)
         return LayerNorm(name="ln_f")(x), tuple(seen)
 

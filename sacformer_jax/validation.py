@@ -136,6 +136,13 @@ def _check_actor(config: Config) -> None:
             actor.actor_width % actor.actor_heads == 0,
             f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",
         )
+        head_width = actor.actor_width // actor.actor_heads
+        _require(
+            actor.time_embedding != "rotary" or head_width % 2 == 0,
+            f"time_embedding={actor.time_embedding!r}: turns pairs of numbers, and "
+            f"actor_width={actor.actor_width} over actor_heads={actor.actor_heads} is odd; use an "
+            "even width of heads, or another time_embedding",
+        )
         _require(
             context.tokens == "gs" or context.context_length > 1,
             f"tokens={context.tokens!r}: with context_length=1 there is no action before the "

@@ -28,8 +28,22 @@ def dense(x, p):
     return x @ p["kernel"] + p["bias"]
 
 
-def gpt2_block(x, p, heads, allowed):
-    """Pre-LayerNorm attention and MLP; every token computed."""
+def turned(x, time, heads):
+    """RoFormer's rotation ``[T, D]``: entry i and entry i + E/2 of a head as a complex number."""
+    size = x.shape[1] // heads
+    half = size // 2
+    angle = np.asarray(time, float)[:, None] * 10_000.0 ** (-np.arange(half) / half)
+    out = np.empty_like(x)
+    for head in range(heads):
+        real = slice(head * size, head * size + half)
+        imaginary = slice(head * size + half, (head + 1) * size)
+        z = (x[:, real] + 1j * x[:, imaginary]) * np.exp(1j * angle)
+        out[:, real], out[:, imaginary] = z.real, z.imag
+    return out
+
+
+def gpt2_block(x, p, heads, allowed, time=None):
+    """Pre-LayerNorm attention and MLP; every token computed. With times, rotary attention."""
     tokens, width = x.shape
     h = layer_norm(x, p["ln_1"])
     if "query_key_value" in p:
@@ -37,6 +51,8 @@ def gpt2_block(x, p, heads, allowed):
     else:
         q = dense(h, p["query"])
         k, v = np.split(dense(h, p["key_value"]), 2, axis=-1)
+    if time is not None:
+        q, k = turned(q, time, heads), turned(k, time, heads)
     size = width // heads
     mixed = np.zeros((tokens, width))
     for head in range(heads):

@@ -91,8 +91,10 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
     settings = config.actor
     actor = TransformerActor(
         TransformerConfig(settings.actor_layers, settings.actor_width, settings.actor_heads, 4, 0.0,
-                          settings.actor_activation),
-        ACT, band, spec.max_episode_steps + 1, 1.0, config.context.tokens,
+                          settings.actor_activation, rotary=settings.time_embedding == "rotary"),
+        ACT, band, spec.max_episode_steps + 1 if settings.time_embedding == "absolute" else None,
+        1.0, config.context.tokens,
+        (settings.state_path_width,) * 2 if settings.state_path_width else None,
     )  # fmt: skip
     steps = len(obs)
     so_far = np.concatenate([[0.0], np.cumsum(rewards[: steps - 1], dtype=np.float32)])
@@ -111,12 +113,16 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
 
 
 @pytest.mark.parametrize(
-    ("tokens", "limit"),
-    [("gs", 1000), pytest.param("gsa", 1000, marks=pytest.mark.slow), ("gsa", 100)],
+    ("tokens", "limit", "fields"),
+    [
+        ("gs", 1000, {}),
+        pytest.param("gsa", 1000, {}, marks=pytest.mark.slow),
+        ("gsa", 100, {"time_embedding": "rotary", "state_path_width": 8}),
+    ],
 )
-def test_a_thousand_steps_equal_full_recomputation(tokens, limit):
+def test_a_thousand_steps_equal_full_recomputation(tokens, limit, fields):
     """Two environments whose episodes end at different steps; explored actions in the tokens."""
-    config = acting_config(tokens=tokens, acting_context_limit=limit)
+    config = acting_config(tokens=tokens, acting_context_limit=limit, **fields)
     agent, spec, policy = make_agent(config, 1000)
     steps, ends = 1_100, {(0, 999), (1, 37), (1, 600)}
     rng = np.random.default_rng(0)

@@ -396,6 +396,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"critic_history": 2, "critic": "transformer"}, "critic=mlp"),
     ({"critic_history": 8}, "a window has 7 states"),
     ({"state_path_width": -1}, "state_path_width=-1"),
+    ({"time_embedding": "sinusoidal"}, "time_embedding='sinusoidal'"),
+    ({"time_embedding": "rotary", "actor_width": 6, "actor_heads": 2}, "even width"),
     *(
         (
             {**what, "agent": "sac", "context_length": 1, "return_conditioning": "none"},

@@ -17,10 +17,12 @@ OBS, ACT, K, BATCH, MAX_TIME = 5, 3, 4, 3, 30
 
 
 def make_actor(
-    layers=3, width=16, heads=1, dropout=0.1, context_length=K, tokens="gs", state_path=None
-):
-    config = TransformerConfig(layers, width, heads, 4, dropout, "relu")
-    return TransformerActor(config, ACT, context_length, MAX_TIME, 1.0, tokens, state_path)
+    layers=3, width=16, heads=1, dropout=0.1, context_length=K, tokens="gs", state_path=None,
+    time="absolute",
+):  # fmt: skip
+    config = TransformerConfig(layers, width, heads, 4, dropout, "relu", rotary=time == "rotary")
+    max_time = MAX_TIME if time == "absolute" else None
+    return TransformerActor(config, ACT, context_length, max_time, 1.0, tokens, state_path)
 
 
 def make_inputs(states=K, seed=0):
@@ -40,14 +42,15 @@ def make_inputs(states=K, seed=0):
 # --- the oracle: plain NumPy in float64 ------------------------------------------------------
 
 
-def oracle(params, inputs, layers, heads, band, tokens="gs"):
+def oracle(params, inputs, layers, heads, band, tokens="gs", rotary=False):
     params = jax.tree.map(lambda x: np.asarray(x, np.float64), params["params"])
     means, log_stds = [], []
     for b in range(BATCH):
-        time = params["embed_time"]["embedding"][inputs["time_step"][b]]
+        steps = inputs["time_step"][b]
+        time = params["embed_time"]["embedding"][steps] if "embed_time" in params else 0.0
         g = dense(inputs["return_to_go"][b][:, None].astype(float), params["embed_return"]) + time
         s = dense(inputs["obs"][b].astype(float), params["embed_state"]) + time
-        states, n = len(time), len(tokens)
+        states, n = len(steps), len(tokens)
         x = np.empty((n * states, g.shape[1]))
         x[0::n], x[1::n] = g, s
         if tokens == "gsa":
@@ -60,7 +63,8 @@ def oracle(params, inputs, layers, heads, band, tokens="gs"):
                 in_band = i // n - j // n < band
                 allowed[i, j] = in_band and (same_step or inputs["state_mask"][b, j // n])
         for layer in range(layers):
-            x = gpt2_block(x, params["trunk"][f"block_{layer}"], heads, allowed)
+            block, when = params["trunk"][f"block_{layer}"], np.repeat(steps, n)
+            x = gpt2_block(x, block, heads, allowed, when if rotary else None)
         x = layer_norm(x, params["trunk"]["ln_f"])[1::n]
         if "state_path" in params:
             by_state = inputs["obs"][b].astype(float)
@@ -73,21 +77,24 @@ def oracle(params, inputs, layers, heads, band, tokens="gs"):
 
 
 @pytest.mark.parametrize(
-    ("layers", "heads", "states", "tokens", "state_path"),
+    ("layers", "heads", "states", "tokens", "state_path", "time"),
     [
-        (3, 1, K, "gs", None),
-        (2, 2, K, "gs", None),
-        (2, 4, K + 1, "gs", None),
-        (3, 1, K + 1, "gsa", None),
-        (1, 2, K, "gsa", (12, 10)),
+        (3, 1, K, "gs", None, "absolute"),
+        (2, 2, K, "gs", None, "none"),
+        (2, 4, K + 1, "gs", None, "absolute"),
+        (3, 1, K + 1, "gsa", None, "absolute"),
+        (1, 2, K, "gsa", (12, 10), "absolute"),
+        (2, 2, K + 1, "gsa", None, "rotary"),
     ],
 )
-def test_actor_equals_the_numpy_decision_transformer(layers, heads, states, tokens, state_path):
-    actor = make_actor(layers=layers, heads=heads, tokens=tokens, state_path=state_path)
+def test_actor_equals_the_numpy_decision_transformer(
+    layers, heads, states, tokens, state_path, time
+):
+    actor = make_actor(layers=layers, heads=heads, tokens=tokens, state_path=state_path, time=time)
     inputs = make_inputs(states)
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
     out = jax.jit(gaussian_of(actor))(params, **inputs)
-    mean, log_std = oracle(params, inputs, layers, heads, K, tokens)
+    mean, log_std = oracle(params, inputs, layers, heads, K, tokens, time == "rotary")
     real = inputs["state_mask"]
     np.testing.assert_allclose(out.mean[real], mean[real], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(out.log_std[real], log_std[real], rtol=1e-5, atol=1e-5)
@@ -213,9 +220,9 @@ def test_dropout_is_on_only_where_asked_for():
     np.testing.assert_array_equal(mean(jax.random.key(0)), mean(jax.random.key(0)))
 
 
-@pytest.mark.parametrize("tokens", ["gs", "gsa"])
-def test_a_state_with_a_past_is_as_in_one_pass(tokens):
-    actor = make_actor(heads=2, tokens=tokens)
+@pytest.mark.parametrize(("tokens", "time"), [("gs", "absolute"), ("gsa", "rotary")])
+def test_a_state_with_a_past_is_as_in_one_pass(tokens, time):
+    actor = make_actor(heads=2, tokens=tokens, time=time)
     inputs = make_inputs(K + 1)
     params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
     together = jax.jit(gaussian_of(actor))(params, **inputs)
@@ -257,3 +264,17 @@ def test_with_a_path_around_it_the_trunk_starts_with_nothing_to_say_and_learns()
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(first["trunk"]))
     params["params"]["from_trunk"]["kernel"] += 0.1 * first["from_trunk"]["kernel"]
     assert all(np.any(leaf) for leaf in jax.tree.leaves(gradient(params)["embed_state"]))
+
+
+@pytest.mark.parametrize("time", ["absolute", "rotary", "none"])
+def test_what_counts_of_the_time(time):
+    actor = make_actor(layers=1, time=time)
+    inputs = make_inputs()
+    inputs["state_mask"][:] = True
+    params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
+    apply = jax.jit(gaussian_of(actor))
+    before = apply(params, **inputs).mean
+    later = apply(params, **{**inputs, "time_step": inputs["time_step"] + 7}).mean
+    wider = apply(params, **{**inputs, "time_step": 2 * inputs["time_step"]}).mean
+    assert np.allclose(later, before, atol=1e-5) == (time != "absolute")
+    assert np.allclose(wider, before, atol=1e-5) == (time == "none")
