@@ -30,6 +30,7 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "no-time": {"time_embedding": "none"},
     "rotary": {"time_embedding": "rotary"},
     "td-lambda": {"td_lambda": 0.5},
+    "td-lambda-larger": {"td_lambda": 0.8},
     "critic-norm": {"critic_layer_norm": True},
     "critic-features": {"critic_features": True},
     "predicting": {"prediction_weight": 1.0},
@@ -37,6 +38,11 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "short-windows": {"context_length": 3, "batch_size": 64},
     # What the upper blocks have heard of is kept in acting, as training shows it.
     "burn-in": {"burn_in": K - 1, "acting_context": "episode", "acting_context_limit": K},
+}
+TOGETHER: dict[str, dict[str, Any]] = {
+    "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
+    "lambda-path": {"td_lambda": 0.5, "state_path_width": 256},
+    "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
 }
 SAC: dict[str, dict[str, Any]] = {
     "sac": {},
@@ -48,7 +54,8 @@ SAC: dict[str, dict[str, Any]] = {
 
 def study() -> Study:
     """All its runs."""
-    variants = {name: {"agent": "sacformer", **changes} for name, changes in SACFORMER.items()}
+    changed = SACFORMER | TOGETHER
+    variants = {name: {"agent": "sacformer", **changes} for name, changes in changed.items()}
     variants |= {name: {"agent": "sac", **changes} for name, changes in SAC.items()}
     configs = {
         f"{task}-{variant}": Config.from_preset(
