@@ -49,6 +49,8 @@ SAC: dict[str, dict[str, Any]] = {
     "sac-critic-norm": {"critic_layer_norm": True},
     "sac-slower-critic": {"critic_learning_rate": 3e-4},
     "sac-faster-actor": {"actor_learning_rate": 1e-3},
+    # The same returns along windows, without a transformer: 42 windows of 6 for 256 single steps.
+    "sac-lambda": {"learnt_steps": K, "batch_size": 42, "td_lambda": 0.5},
 }
 
 

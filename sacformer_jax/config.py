@@ -118,9 +118,11 @@ class ContextConfig:
 
     context_length: int = 6
     """K: (return-to-go, state) pairs the actor sees, in training and in acting on the window."""
+    learnt_steps: int | None = None
+    """Steps of a window that are learnt from; None: K (sacformer, sac)."""
     burn_in: int = 0
-    """Steps before those K of a window that are looked at but not learnt from, so that learning
-    sees as much of the past as acting does; K - 1 for all of it."""
+    """Steps before those of a window that are looked at but not learnt from, so that learning sees
+    as much of the past as acting does; K - 1 for all of it."""
     acting_context: ActingContext = "window"
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
     acting_context_limit: int | None = None
@@ -145,9 +147,14 @@ class ContextConfig:
     """Normalize observations by their running mean and variance."""
 
     @property
+    def steps_to_learn(self) -> int:
+        """Steps of a window that are learnt from."""
+        return self.context_length if self.learnt_steps is None else self.learnt_steps
+
+    @property
     def window_length(self) -> int:
         """Steps of a window that is drawn from the replay."""
-        return self.burn_in + self.context_length
+        return self.burn_in + self.steps_to_learn
 
 
 @dataclasses.dataclass(frozen=True)

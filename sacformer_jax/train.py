@@ -163,7 +163,7 @@ def _learning(config: Config, env: VectorEnv, agent: Agent) -> ReplayLearning | 
         length=config.replay.buffer_capacity // (env.num_envs * env.data.size),
         obs_size=env.spec.obs_size,
         action_size=env.spec.action_size,
-        context_length=config.context.context_length,
+        context_length=config.context.steps_to_learn,
         burn_in=config.context.burn_in,
         max_episode_steps=env.max_episode_steps,
         hindsight=config.context.return_conditioning == "hindsight",

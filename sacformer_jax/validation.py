@@ -159,24 +159,36 @@ def _check_policy(config: Config) -> None:
 
 
 def _check_past(config: Config) -> None:
-    """What looks back over a window needs one whose steps follow each other, long enough."""
+    """What looks along a window needs one whose steps follow each other, and enough of them."""
     context, critic, td_lambda = config.context, config.critic, config.learning.td_lambda
+    _require(
+        context.learnt_steps is None or context.learnt_steps >= 1,
+        f"learnt_steps={context.learnt_steps}: must be at least 1, or None for context_length",
+    )
     asked = {
-        f"burn_in={context.burn_in}": context.burn_in > 0,
-        f"critic_history={critic.critic_history}": critic.critic_history > 1,
-        f"td_lambda={td_lambda}": td_lambda > 0,
+        ("burn_in", 0): context.burn_in,
+        ("critic_history", 1): critic.critic_history,
+        ("td_lambda", 0): td_lambda,
+        ("learnt_steps", None): context.learnt_steps,
     }
-    for what, is_asked in asked.items():
-        off = f"{what.split('=')[0]}={1 if 'history' in what else 0}"
+    for (name, off), value in asked.items():
+        along = name in ("td_lambda", "learnt_steps")
+        agents = ("sacformer", "sac") if along else ("sacformer",)
         _require(
-            not is_asked or config.agent not in MLP_AGENTS,
-            f"{what}: agent={config.agent} learns from single steps; use {off}, or agent=sacformer",
+            value == off or config.agent in agents,
+            f"{name}={value}: agent={config.agent} learns from single steps; use {name}={off}, or "
+            f"agent={' or '.join(agents)}",
         )
         _require(
-            not is_asked or context.window == "contiguous",
-            f"{what}: steps of window=scattered do not follow each other; use {off}, or "
-            "window=contiguous",
+            value == off or context.window == "contiguous",
+            f"{name}={value}: steps of window=scattered do not follow each other; use "
+            f"{name}={off}, or window=contiguous",
         )
+    _require(
+        td_lambda == 0 or context.steps_to_learn > 1,
+        f"td_lambda={td_lambda}: a window of a single step has nothing after it; use td_lambda=0, "
+        "or learnt_steps of 2 or more",
+    )
     _require(
         critic.critic_history == 1 or critic.critic == "mlp",
         f"critic_history={critic.critic_history}: is for critic=mlp; a transformer sees the whole "
@@ -191,8 +203,8 @@ def _check_past(config: Config) -> None:
     _require(
         critic.critic_history <= context.window_length + 1,
         f"critic_history={critic.critic_history}: a window has {context.window_length + 1} states "
-        f"(burn_in={context.burn_in}, context_length={context.context_length} and one after "
-        "them); use as many or fewer",
+        f"(burn_in={context.burn_in}, {context.steps_to_learn} to learn from and one after them); "
+        "use as many or fewer",
     )
 
 

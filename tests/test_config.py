@@ -392,6 +392,17 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"td_lambda": 1.5}, "td_lambda=1.5"),
     ({"td_lambda": -0.5}, "td_lambda=-0.5"),
     ({"td_lambda": 0.5, "window": "scattered", "prefill_env_steps": 100}, "use td_lambda=0"),
+    *(
+        (
+            {**what, "agent": "td3", "context_length": 1, "return_conditioning": "none"},
+            "agent=sacformer or sac",
+        )
+        for what in ({"td_lambda": 0.5}, {"learnt_steps": 2})
+    ),
+    ({"td_lambda": 0.5, "context_length": 1}, "learnt_steps of 2 or more"),
+    ({"learnt_steps": 0}, "learnt_steps=0"),
+    ({"learnt_steps": 2, "window": "scattered", "prefill_env_steps": 100}, "use learnt_steps=None"),
+    ({"buffer_capacity": 112, "learnt_steps": 7}, "at least 114"),
     ({"critic_history": 0}, "critic_history=0"),
     ({"critic_history": 2, "critic": "transformer"}, "critic=mlp"),
     ({"critic_history": 8}, "a window has 7 states"),
@@ -406,7 +417,6 @@ BAD: list[tuple[dict[str, Any], str]] = [
         for what in (
             {"burn_in": 1},
             {"critic_history": 2},
-            {"td_lambda": 0.5},
             {"state_path_width": 8},
             {"prediction_weight": 1.0},
             {"critic_features": True},

@@ -135,6 +135,37 @@ def test_lambda_target_is_the_mean_of_targets_of_one_step_two_and_so_on():
             assert float(got[b, t]) == pytest.approx(expected, rel=1e-5)
 
 
+def test_sac_learns_from_windows_as_from_their_steps():
+    """An update on windows is that on single steps of the same weights, with the same noise."""
+    single = {"context_length": 1, "return_conditioning": "none"}
+    config = point_config(agent="sac", learnt_steps=K, **single)
+    agent = agents.make(config, point_env(1).spec)
+    learner, hyper = jax.jit(agent.init)(jax.random.key(0)), hyperparameters(config, 1)
+    windows, key = make_window(), jax.random.key(7)
+
+    def apart(x, states=False):
+        """``[B, K, ...]`` or ``[B, K+1, ...]`` -> ``[B K, 1, ...]`` or ``[B K, 2, ...]``."""
+        pairs = jnp.stack([x[:, :-1], x[:, 1:]], axis=2) if states else x[:, :, None]
+        return pairs.reshape(-1, *pairs.shape[2:])
+
+    of_states = ("obs", "return_so_far", "return_to_go", "time_step", "state_mask")
+    of_steps = ("action", "reward", "discount", "mask", "bootstrap_mask")
+    steps = Window(
+        **{name: apart(getattr(windows, name), states=True) for name in of_states},
+        **{name: apart(getattr(windows, name)) for name in of_steps},
+        weight=jnp.repeat(windows.weight, K),
+    )
+    update = jax.jit(agent.update)
+    together, by_steps = update(learner, hyper, windows, key), update(learner, hyper, steps, key)
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(by_steps), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+
+    # λ makes a difference, which single steps have nothing to show for.
+    along = jax.jit(agents.make(config.replace(td_lambda=0.6), point_env(1).spec).update)
+    loss = float(along(learner, hyper, windows, key)[1]["critic_loss"])
+    assert loss != float(together[1]["critic_loss"])
+
+
 def test_step_weights():
     window = make_window().replace(
         weight=jnp.array([0.5, 1.0, 0.0, 0.0, 0.0]),
