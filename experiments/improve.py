@@ -43,6 +43,8 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
     "lambda-path": {"td_lambda": 0.5, "state_path_width": 256},
     "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
+    "lambda-no-time": {"td_lambda": 0.5, "time_embedding": "none"},
+    "lambda-path-no-time": {"td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256},
 }
 SAC: dict[str, dict[str, Any]] = {
     "sac": {},
