@@ -24,7 +24,7 @@ _CAPTION = (
     "Gradients: signal-to-noise ratio of an update's gradient at the restored state, dark bars of "
     "the actor, pale and hatched ones of the critics; the dotted line is what pure noise gives. "
     "Attention: of the state acted on, mean over heads and blocks, by steps back and kind of "
-    "token. Q: the smaller critic against the discounted return, entropy included, of the same "
+    "token. Q: the smaller critic against the discounted return with entropy (soft) of the same "
     "policy. Return tokens: scaled, in training batches (filled) and in evaluation (line). All "
     "seeds together, bars and attention as means."
 )
@@ -52,7 +52,10 @@ def draw(runs: Runs, num_batches: int, path: Path) -> None:
             _draw_values(panels[2], members)
             _draw_tokens(panels[3], members)
             if len(runs) > 1:
-                panels[0].set_title(f"{label}\n{panels[0].get_title()}")
+                panels[0].set_title(f"{label}\n{panels[0].get_title()}", fontsize=8)
+            if len(runs) > 1 and place > 0:  # as in the first column
+                for axes in panels[1:]:
+                    axes.set_ylabel("")
             for axes in panels:
                 tidy(axes)
         if len(runs) == 1:
@@ -103,7 +106,7 @@ def _draw_attention(axes: Axes, means: dict[str, float]) -> None:
 
 
 def _draw_values(axes: Axes, members: list[Diagnosis]) -> None:
-    axes.set(title="Q", xlabel="discounted soft return", ylabel="min Q")
+    axes.set(title="Q", xlabel="soft return", ylabel="min Q")
     returns = np.concatenate([one.steps.returns for one in members])
     q = np.concatenate([one.steps.q for one in members])
     if not q.size:
@@ -130,6 +133,8 @@ def _draw_tokens(axes: Axes, members: list[Diagnosis]) -> None:
 
 
 def _say_nothing(axes: Axes, why: str) -> None:
-    axes.text(0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, color="0.4")
+    axes.text(
+        0.5, 0.5, why, ha="center", va="center", transform=axes.transAxes, color="0.4", fontsize=7
+    )
     axes.set_xticks([])
     axes.set_yticks([])
