@@ -113,7 +113,10 @@ def test_damage_gives_the_checkpoint_before(
     assert copy.restore(abstract).moved_aside == ()
 
 
-@pytest.mark.parametrize("kind", ["bits", "emptied", "missing"])
+@pytest.mark.parametrize(
+    "kind",
+    ["bits", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("emptied", "missing"))],
+)
 def test_damage_beside_the_arrays_does_not_pass_either(
     copy: RunFolder,
     program: Program,

@@ -119,6 +119,7 @@ def test_saved_on_eight_devices_and_restored_on_one(on_eight: Path, tmp_path: Pa
         assert np.isfinite(load_policy(on_eight, "latest", seed).predict(obs)[0]).all()
 
 
+@pytest.mark.slow
 def test_the_data_may_be_split_otherwise_on_the_way(stopped: Path, tmp_path: Path) -> None:
     path = _copy(stopped, tmp_path / "run")
     said = _sacformer(8, "resume", path, "--total-env-steps", TOTAL, "--data-devices", 2)
@@ -170,6 +171,7 @@ def test_two_processes_train_one_run_and_one_continues_it(straight: Path, tmp_pa
     np.testing.assert_allclose(_losses(path), _losses(straight), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_two_processes_continue_what_one_began(
     straight: Path, stopped: Path, tmp_path: Path
 ) -> None:

@@ -357,6 +357,7 @@ def _pendulums_forgotten():
     return host
 
 
+@pytest.mark.slow
 def test_a_train_state_goes_on_the_same_where_nothing_is_alive():
     program = make_program(Config.from_preset("cpu", agent="sac", **TINY))
     state, _ = program.prefill(program.init(jax.random.key(0)))

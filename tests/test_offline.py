@@ -219,6 +219,7 @@ def test_the_actor_comes_to_do_as_it_was_shown(cloned: dict[str, float]) -> None
     assert cloned["last error"] < 0.8 * cloned["first error"]
 
 
+@pytest.mark.slow
 def test_the_replay_goes_on_after_the_dataset() -> None:
     """Steps of the environments come after it, and both are drawn."""
     config = point_config(
@@ -319,6 +320,7 @@ def test_mean_actions_are_those_an_evaluation_takes(run: Path) -> None:
             np.testing.assert_allclose(acted.action[0], action, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_from_a_dataset_resumes_as_if_never_stopped(dataset: Path, tmp_path: Path) -> None:
     config = Config.from_preset(
         "cpu", **TINY, dataset=str(dataset), pretrain_updates=20, run_dir=str(tmp_path / "run")

@@ -106,6 +106,7 @@ def test_the_example_ends_where_the_target_is_reached():
     assert steps.terminated[0]
 
 
+@pytest.mark.slow
 def test_the_example_is_the_same_on_both_engines():
     assert_engines_agree(reach, 2e-5)
 

@@ -621,6 +621,7 @@ def test_counts_and_compiles_once(config: Config) -> None:
         _ = program.buffer
 
 
+@pytest.mark.slow
 def test_each_switch_arrives() -> None:
     """With everything off: no statistics, no annealing."""
     config = ppo_config(
@@ -641,6 +642,7 @@ def test_each_switch_arrives() -> None:
 # --- members and devices --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_members_are_what_they_are_alone(config: Config) -> None:
     program = make_program(config, point_env(NUM_ENVS))
     for seeds in ((3, 4), (4,)):
@@ -683,6 +685,7 @@ def test_two_shards_update_as_one_does_on_the_same_minibatch(
             np.testing.assert_allclose(one[1][name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_shards_train_as_one_does_where_the_order_does_not_matter() -> None:
     """Whole rounds, with all steps in each minibatch: acting, statistics, advantages, updates."""
     config = ppo_config(epochs=2, minibatches=1)
@@ -804,6 +807,7 @@ def test_a_run_from_the_command_line_resumes_to_the_bit(
         assert ours.read_bytes() == theirs.read_bytes()
 
 
+@pytest.mark.slow
 def test_an_exported_policy_is_the_mean_within_the_bounds(tmp_path: Path) -> None:
     path = train(Config.from_preset("cpu", **TINY, run_dir=str(tmp_path / "run")), quiet=True).path
     policy = load_policy(path, "latest")

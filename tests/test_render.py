@@ -348,6 +348,7 @@ def test_egl_is_chosen_where_there_is_no_display(
 # --- the command, and training ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_draws_each_member(tmp_path: Path, capsys) -> None:
     run = untrained_run(tmp_path / "run", seeds=2, agent="sac")
     to = tmp_path / "seen" / "hopper.mp4"

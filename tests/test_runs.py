@@ -116,6 +116,7 @@ def test_resuming_equals_never_having_stopped(straight: Outcome, resumed: Outcom
     ]
 
 
+@pytest.mark.slow
 def test_resuming_keeps_the_cache_and_the_table_of_episodes(tmp_path: Path) -> None:
     """With the authors' settings the train state holds both."""
     settings = {**TINY, "total_env_steps": 400, "checkpoint_every": 100}
@@ -133,6 +134,7 @@ def test_resuming_keeps_the_cache_and_the_table_of_episodes(tmp_path: Path) -> N
     assert np.isfinite(_predictions(policy, observations, rewards)).all()
 
 
+@pytest.mark.slow
 def test_a_prefill_without_a_long_enough_episode_is_refused(tmp_path: Path) -> None:
     settings = {**TINY, "window": "scattered", "context_length": 45, "prefill_env_steps": 100}
     config = Config.from_preset("cpu", **settings, run_dir=str(tmp_path / "run"))
@@ -159,6 +161,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_from_the_beginning(
     ).read_bytes()
 
 
+@pytest.mark.slow
 def test_checkpoints_without_the_replay_are_small_and_collect_it_anew(
     straight: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

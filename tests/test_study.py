@@ -239,6 +239,7 @@ def test_ablations_change_one_thing_of_the_preset() -> None:
             assert changed or run.endswith("-sacformer")
 
 
+@pytest.mark.slow
 def test_runs_are_trained_stopped_and_resumed(tmp_path: Path) -> None:
     script = tmp_path / "tiny.py"
     script.write_text(

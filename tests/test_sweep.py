@@ -218,6 +218,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Trained, gone on with for longer, and asked for anew when all is done."""
     path = tmp_path / "sweep"
