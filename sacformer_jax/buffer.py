@@ -37,7 +37,7 @@ class TrajectoryBuffer:
       length: T, ring length of each column in steps.
       obs_size: O.
       action_size: A.
-      context_length: K.
+      context_length: K, steps of a window that are learnt from.
       max_episode_steps: longest episode.
       hindsight: whether windows carry hindsight return-to-go; then only steps of finished
         episodes are drawn.

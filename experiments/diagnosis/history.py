@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diagnosis.numbers import percentiles, share_outside
-from diagnosis.subject import Subject, Tools, contexts_of, draws
+from diagnosis.subject import Subject, Tools, contexts_of, draws, on_windows_of
 from sacformer_jax.agents import sac_policy
 from sacformer_jax.agents.core import Agent
 from sacformer_jax.agents.sac_policy import SACParts, acting_outlook
@@ -79,7 +79,7 @@ def acting_agent(agent: Agent, parts: SACParts, newest_only: bool) -> Agent:
     """
     if not newest_only:
         return agent
-    on_windows = _on_windows(parts)
+    on_windows = on_windows_of(parts)
 
     def act(policy: PolicyState, context: Context, key: jax.Array, explore: bool) -> Acted:
         acted = sac_policy.act(on_windows, policy, _newest(context), key, explore)
@@ -88,10 +88,6 @@ def acting_agent(agent: Agent, parts: SACParts, newest_only: bool) -> Agent:
     return dataclasses.replace(
         agent, act=act, init_cache=lambda num: sac_policy.init_cache(on_windows, num)
     )
-
-
-def _on_windows(parts: SACParts) -> SACParts:
-    return dataclasses.replace(parts, acting_actor=parts.actor)
 
 
 def _newest(context: Context) -> Context:
@@ -120,7 +116,7 @@ class Actor:
 def make_actor(tools: Tools, env: VectorEnv) -> Actor:
     """Binds a run's agent to the environments that it is evaluated in."""
     agent, parts = tools.program.agent, tools.parts
-    length, on_windows = parts.context_length, _on_windows(tools.parts)
+    length, on_windows = parts.context_length, on_windows_of(tools.parts)
 
     def means(newest_only: bool) -> Callable[[PolicyState, Context], jax.Array]:
         @jax.jit

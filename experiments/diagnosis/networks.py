@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diagnosis.numbers import dormant_share, effective_rank
-from diagnosis.subject import Subject, contexts_of
+from diagnosis.subject import Subject, contexts_of, on_windows_of
 from sacformer_jax.agents.sac_policy import acting_outlook, window_policies
 from sacformer_jax.agents.sac_update import critic_inputs
 from sacformer_jax.attention import acting_attention
@@ -154,7 +154,7 @@ def representation_numbers(subject: Subject, windows: Window) -> dict[str, float
     """
     parts, learner = subject.tools.parts, subject.state.learner
     # As trained: on windows, whatever acting sees.
-    on_windows = dataclasses.replace(parts, acting_actor=parts.actor)
+    on_windows = on_windows_of(parts)
     contexts: Context = contexts_of(windows, subject.config.context.context_length)
     actor = activations(
         lambda policy, contexts: (

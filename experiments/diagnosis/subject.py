@@ -140,6 +140,11 @@ def _key(seed: int, draw: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), draw)
 
 
+def on_windows_of(parts: SACParts) -> SACParts:
+    """The same parts, acting on windows computed anew, whatever acting sees."""
+    return dataclasses.replace(parts, acting_actor=parts.actor)
+
+
 def contexts_of(window: Window, num_pairs: int) -> Context:
     """The contexts ``[B, K]`` that acting would have at the last steps of windows."""
     steps = window.action.shape[1]

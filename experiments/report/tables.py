@@ -17,6 +17,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from report.lines import Line, StudyLines, grouped, label_of
 from report.published import ABOUT, PUBLISHED, ratio_to_cleanrl
 from report.scores import (
@@ -57,20 +59,21 @@ class Aggregate:
 def aggregates(study: StudyLines, baseline: str) -> list[Aggregate]:
     """Of every variant, in their order."""
     rated = rated_tasks(study)
+
+    def normalized_scores(variant: str, tasks: Sequence[str]) -> list[np.ndarray]:
+        return [normalized(task, study.lines[task, variant].scores) for task in tasks]
+
     made = []
     for variant in study.variants:
         finished = study.finished_tasks(variant)
         iqm = difference = improvement = None
         if rated and set(rated) <= set(finished):
-            iqm = iqm_estimate(
-                [normalized(task, study.lines[task, variant].scores) for task in rated]
-            )
+            iqm = iqm_estimate(normalized_scores(variant, rated))
         common = [task for task in finished if study.finished(task, baseline)]
         comparable = [task for task in common if task in rated]
         if variant != baseline and comparable:
             difference = iqm_difference(
-                [normalized(task, study.lines[task, variant].scores) for task in comparable],
-                [normalized(task, study.lines[task, baseline].scores) for task in comparable],
+                normalized_scores(variant, comparable), normalized_scores(baseline, comparable)
             )
         if variant != baseline and common:
             improvement = probability_of_improvement(

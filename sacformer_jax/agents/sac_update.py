@@ -312,8 +312,8 @@ class _Predicted:
 
 
 def _learn_to_predict(parts: SACParts, half: _Half, window: Window) -> _Predicted:
-    """Half the squared error of the predicted change of an observation, mean over its numbers and
-    the steps whose next observation is known.
+    """Half the squared error of the predicted change of an observation, mean over its numbers;
+    steps weigh as in the critics' loss, those whose next observation is not known nothing.
     """
     if half.prediction is None:
         return _Predicted(None, {})
