@@ -5,8 +5,8 @@ python experiments/improve.py --jobs 2
 60,000 env steps, seeds 0 to 2 in one program, for SACFormer and for SAC, which gets what it can
 have, too. Every variant is first trained on Hopper and Walker2d. The rule by which it is given up,
 written down before anything was run: its normalized score, averaged over both tasks and all seeds,
-is not above that of the agent as it is. What is left goes on to HalfCheetah and Ant, and what is
-ahead over all four is put together.
+is not above that of the agent as it is. What is left (`FURTHER`) goes on to HalfCheetah and Ant,
+and what is ahead over all four is put together.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from study import Study
 from sacformer_jax import Config
 
 TASKS = ("Hopper", "Walker2d")
+FURTHER_TASKS = ("HalfCheetah", "Ant")
 ENV_STEPS, SEEDS = 60_000, 3
 K = 6
 """Of preset `cpu`."""
@@ -45,15 +46,25 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
     "lambda-no-time": {"td_lambda": 0.5, "time_embedding": "none"},
     "lambda-path-no-time": {"td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256},
-}
+    "lambda-path-predicting": {
+        "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
+        "prediction_weight": 1.0,
+    },
+}  # fmt: skip
+# As many single steps as SAC learns from otherwise, but for four.
+_WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
 SAC: dict[str, dict[str, Any]] = {
     "sac": {},
     "sac-critic-norm": {"critic_layer_norm": True},
     "sac-slower-critic": {"critic_learning_rate": 3e-4},
     "sac-faster-actor": {"actor_learning_rate": 1e-3},
     # The same returns along windows, without a transformer: 42 windows of 6 for 256 single steps.
-    "sac-lambda": {"learnt_steps": K, "batch_size": 42, "td_lambda": 0.5},
+    "sac-lambda": {**_WINDOWS, "td_lambda": 0.5},
+    "sac-lambda-larger": {**_WINDOWS, "td_lambda": 0.8},
+    "sac-lambda-norm": {**_WINDOWS, "td_lambda": 0.5, "critic_layer_norm": True},
 }
+FURTHER = ("sacformer", "td-lambda", "lambda-path", "lambda-path-no-time", "sac", "sac-lambda")
+"""Variants that are trained on all four tasks."""
 
 
 def study() -> Study:
@@ -65,7 +76,10 @@ def study() -> Study:
         f"{task}-{variant}": Config.from_preset(
             "cpu", env=task, seeds=SEEDS, total_env_steps=ENV_STEPS, **changes
         )
-        for (variant, changes), task in itertools.product(variants.items(), TASKS)
+        for (variant, changes), task in itertools.product(
+            variants.items(), (*TASKS, *FURTHER_TASKS)
+        )
+        if task in TASKS or variant in FURTHER
     }
     return Study("improve", configs, __file__)
 
