@@ -5,7 +5,9 @@ python experiments/memory.py --arena delay --jobs 2   # actions come into effect
 
 Preset `cpu`, 60,000 env steps, seeds 0 to 2 in one program. SAC sees the last K observations with
 the actions between them; SACFormer the same history, as K pairs with its own actions among them.
-Return-to-go tells of the reward and so of the velocity: none of these has it, but one.
+Return-to-go tells of the reward and so of the velocity: none of these has it, but one. Both agents
+have the λ-returns along windows which improve.py shows to help both, SACFormer beside them relative
+positions, as the embedding of the time step was seen to be noise.
 """
 
 from __future__ import annotations
@@ -27,17 +29,34 @@ ARENAS: dict[str, dict[str, Any]] = {
     "delay": {"action_delay": 2},
 }
 _SEQUENCE: dict[str, Any] = {"tokens": "gsa", "return_conditioning": "none"}
+# Every step is learnt from with all the past that acting shows.
+_WHOLE_PAST: dict[str, Any] = {
+    "burn_in": K - 1,
+    "acting_context": "episode",
+    "acting_context_limit": K,
+}
+_LAMBDA: dict[str, Any] = {"td_lambda": 0.5}
+_LAMBDA_SEQUENCE: dict[str, Any] = {
+    **_SEQUENCE, **_WHOLE_PAST, **_LAMBDA, "time_embedding": "rotary",
+}  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"agent": "sac", "stack_obs": K},
+    "sac-lambda": {
+        "agent": "sac", "stack_obs": K, "learnt_steps": K, "batch_size": 42, **_LAMBDA,
+    },
     "sac-one-state": {"agent": "sac"},
     # Critics that see no more than the current state.
     "blind-critic": _SEQUENCE,
     "critic-features": {**_SEQUENCE, "critic_features": True},
     "predicting-features": {**_SEQUENCE, "critic_features": True, "prediction_weight": 1.0},
-    # Every step is learnt from with all the past that acting shows.
-    "critic-history": {
-        **_SEQUENCE, "critic_history": K, "burn_in": K - 1, "acting_context": "episode",
-        "acting_context_limit": K,
+    "critic-history": {**_SEQUENCE, **_WHOLE_PAST, "critic_history": K},
+    "lambda-history": {**_LAMBDA_SEQUENCE, "critic_history": K},
+    "lambda-predicting": {
+        **_LAMBDA_SEQUENCE, "critic_features": True, "prediction_weight": 1.0,
+    },
+    "lambda-predicting-path": {
+        **_LAMBDA_SEQUENCE, "critic_features": True, "prediction_weight": 1.0,
+        "state_path_width": 256,
     },
     "with-return": {
         "tokens": "gsa", "critic_features": True, "prediction_weight": 1.0,
