@@ -24,8 +24,8 @@ from sacformer_jax.envs.tasks import TASKS
 
 NUM_ENVS, NUM_STEPS, KEPT_EVERY = 8, 60, 6
 # Compiling MJX's step takes from a quarter of a minute (HalfCheetah) to one and a half (Humanoid).
-QUICK = ("Hopper", "Ant")
-EACH_TASK = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in TASKS]
+QUICK = "Hopper"
+EACH_TASK = [pytest.param(name, marks=() if name == QUICK else pytest.mark.slow) for name in TASKS]
 # Largest differences allowed over NUM_ENVS * NUM_STEPS single environment steps: qpos and qvel
 # absolute, as are rewards; observations relative to 1 + their size.
 TOLERANCES = {
@@ -169,9 +169,17 @@ def test_resets_agree_with_c_mujoco_and_come_only_where_asked_for(name):
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(none))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
+# An environment that breaks down takes every iteration that the solver may take.
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.nan,
+        pytest.param(np.inf, marks=pytest.mark.slow),
+        pytest.param(1e12, marks=pytest.mark.slow),
+    ],
+)
 def test_a_breakdown_is_reported_and_stays_alone(value):
-    made = case("HalfCheetah")
+    made = case(QUICK)
     broken = dataclasses.replace(made.states, qvel=made.states.qvel.at[3, 2].set(value))
     physics, *_ = jax.device_get(made.step(broken, made.actions, made.resets, made.noise))
     np.testing.assert_array_equal(physics.bad, np.arange(len(made.actions)) == 3)

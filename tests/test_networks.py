@@ -255,8 +255,9 @@ def test_with_a_path_around_it_the_trunk_starts_with_nothing_to_say_and_learns()
     np.testing.assert_array_equal(apply(params, **other_past).mean[:, -1], before.mean[:, -1])
     assert not np.allclose(apply(params, **other_past).mean[:, 0], before.mean[:, 0])
 
+    @jax.jit
     def gradient(params):
-        return jax.jit(jax.grad(lambda p: apply(p, **inputs).mean.sum()))(params)["params"]
+        return jax.grad(lambda p: apply(p, **inputs).mean.sum())(params)["params"]
 
     # At first only the layer from the trunk learns of its part, then the trunk does, too.
     first = gradient(params)
