@@ -50,10 +50,6 @@ TOGETHER: dict[str, dict[str, Any]] = {
         "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
         "prediction_weight": 1.0,
     },
-    "lambda-path-foresight": {
-        "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
-        "prediction_weight": 1.0, "critic_foresight": True,
-    },
 }  # fmt: skip
 # As many single steps as SAC learns from otherwise, but for four.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}

@@ -211,8 +211,6 @@ class CriticConfig:
     """States that a critic sees, the newest included, with the actions between them (mlp)."""
     critic_features: bool = False
     """Critics see the transformer's features of the past, too, as given (mlp)."""
-    critic_foresight: bool = False
-    """Critics see what the actor's prediction makes of an action, too, as given (mlp)."""
     critic_heads: int = 1
     """Attention heads (transformer)."""
     critic_activation: Activation = "relu"

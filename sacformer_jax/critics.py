@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import flax.linen as nn
 import flax.struct
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 
 from sacformer_jax.config import CriticConfig
 from sacformer_jax.layers import Dense
-from sacformer_jax.networks import KERNEL_INITS, MLP, Predictor, embed_steps
+from sacformer_jax.networks import KERNEL_INITS, MLP, embed_steps
 from sacformer_jax.transformer import (
     Transformer,
     TransformerConfig,
@@ -25,21 +24,6 @@ from sacformer_jax.transformer import (
 from sacformer_jax.types import Params
 
 _MLP_RATIO = 4
-
-
-@flax.struct.dataclass
-class CriticOutlook:
-    """What is needed to say where an action leads.
-
-    Attributes:
-      params: of the actor's predictor.
-      features: of the actor's trunk at the steps, ``[B, K, D]``.
-      next_features: after the steps, ``[B, K, D]``.
-    """
-
-    params: Params
-    features: jax.Array
-    next_features: jax.Array
 
 
 @flax.struct.dataclass
@@ -54,7 +38,6 @@ class CriticInputs:
       time_step: int32 ``[B, K+1]``; looked at by the transformer alone.
       state_mask: bool ``[B, K+1]``; looked at by those that see the past, whose windows are
         contiguous.
-      outlook: for critics that see what an action leads to; None for others.
     """
 
     obs: jax.Array
@@ -62,7 +45,6 @@ class CriticInputs:
     action: jax.Array
     time_step: jax.Array
     state_mask: jax.Array
-    outlook: CriticOutlook | None = None
 
 
 Judge = Callable[[Params, CriticInputs, jax.Array], jax.Array]
@@ -196,33 +178,6 @@ def mlp_critics(
         init=lambda key, inputs: critic.init(key, seen_now(inputs), inputs.action),
         now=lambda params, inputs, candidate: judge(params, seen_now(inputs), candidate),
         following=lambda params, inputs, candidate: judge(params, seen_next(inputs), candidate),
-    )
-
-
-def with_foresight(critics: Critics, predictor: Predictor) -> Critics:
-    """Critics that see of a candidate also what the actor's predictor makes of it: its hidden
-    units, which tell what state it leads to. Gradients to the candidate pass through those, too.
-    """
-
-    def seen(inputs: CriticInputs, features: str, candidate: jax.Array) -> jax.Array:
-        assert inputs.outlook is not None
-        params, at = inputs.outlook.params, getattr(inputs.outlook, features)
-        predicted: Any = predictor.apply(params, at, candidate)
-        return jnp.concatenate([candidate, predicted.hidden], axis=-1)
-
-    def init(key: jax.Array, inputs: CriticInputs) -> Params:
-        unknown = jnp.zeros((*inputs.action.shape[:-1], predictor.width))
-        action = jnp.concatenate([inputs.action, unknown], axis=-1)
-        return critics.init(key, dataclasses.replace(inputs, action=action))
-
-    return Critics(
-        init,
-        now=lambda params, inputs, candidate: critics.now(
-            params, inputs, seen(inputs, "features", candidate)
-        ),
-        following=lambda params, inputs, candidate: critics.following(
-            params, inputs, seen(inputs, "next_features", candidate)
-        ),
     )
 
 

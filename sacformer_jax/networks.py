@@ -189,8 +189,7 @@ class TransformerActor(nn.Module):
             features, seen = self._features(step, time_step, state_mask, deterministic, past)
         prediction = None
         if self.predicts and not self.cached:
-            predictor = make_predictor(self.config, obs.shape[-1], name="prediction")
-            prediction = predictor(features, action).change
+            prediction = self._predicted(features, action, obs.shape[-1])
         output = features
         if self.state_path is not None:
             newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
@@ -200,6 +199,14 @@ class TransformerActor(nn.Module):
             output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(features)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(output), seen, features, prediction)
+
+    def _predicted(self, features: jax.Array, action: jax.Array, size: int) -> jax.Array:
+        """How the state changes under the actions taken, ``[B, T, O]``."""
+        cfg = self.config
+        both = jnp.concatenate([features, action], axis=-1)
+        widths = (_PREDICTION_RATIO * cfg.width,)
+        hidden = MLP(widths, cfg.activation, dtype=cfg.dtype, name="prediction")(both)
+        return Dense(size, nn.initializers.zeros, name="prediction_out")(hidden)
 
     def _features(
         self,
@@ -268,48 +275,6 @@ class MLP(nn.Module):
                 x = LayerNorm(name=f"ln_{i}")(x)
             x = ACTIVATIONS[self.activation](x)
         return x.astype(jnp.float32)
-
-
-@flax.struct.dataclass
-class Predicted:
-    """What is expected of an action.
-
-    Attributes:
-      hidden: what the expectation is read off, ``[..., H]``.
-      change: how the state changes, ``[..., O]`` normalized.
-    """
-
-    hidden: jax.Array
-    change: jax.Array
-
-
-class Predictor(nn.Module):
-    """Which state follows: an MLP on the trunk's features and an action.
-
-    Attributes:
-      size: O.
-      width: H.
-      activation: one of :data:`~sacformer_jax.transformer.ACTIVATIONS`.
-      dtype: of the hidden layer's products.
-    """
-
-    size: int
-    width: int
-    activation: str
-    dtype: str = "float32"
-
-    @nn.compact
-    def __call__(self, features: jax.Array, action: jax.Array) -> Predicted:
-        """``features [..., D]``, ``action [..., A]``."""
-        both = jnp.concatenate([features, action], axis=-1)
-        hidden = MLP((self.width,), self.activation, dtype=self.dtype, name="mlp")(both)
-        return Predicted(hidden, Dense(self.size, nn.initializers.zeros, name="change")(hidden))
-
-
-def make_predictor(config: TransformerConfig, size: int, name: str | None = None) -> Predictor:
-    """What predicts O numbers from the features of a trunk."""
-    width = _PREDICTION_RATIO * config.width
-    return Predictor(size, width, config.activation, config.dtype, name=name)
 
 
 class MLPActor(nn.Module):

@@ -200,13 +200,6 @@ def _check_past(config: Config) -> None:
         f"critic_history={critic.critic_history} critics see the past by themselves; use "
         "critic_features=False, or critic=mlp and critic_history=1",
     )
-    weight = config.learning.prediction_weight
-    _require(
-        not critic.critic_foresight or (critic.critic == "mlp" and weight > 0),
-        f"critic_foresight=True: is for critic=mlp and an actor that predicts, not "
-        f"critic={critic.critic} and prediction_weight={weight}; use critic_foresight=False, or "
-        "critic=mlp and prediction_weight=1",
-    )
     _require(
         critic.critic_history <= context.window_length + 1,
         f"critic_history={critic.critic_history}: a window has {context.window_length + 1} states "

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from sacformer_jax.agents.off_policy import OffPolicyParts
 from sacformer_jax.config import Conditioning, Config
 from sacformer_jax.context import commanded_return_to_go
-from sacformer_jax.critics import make_critics, with_foresight
+from sacformer_jax.critics import make_critics
 from sacformer_jax.distributions import ActionDistribution, NoisyPoint, TanhGaussian
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import ActorOutput, GaussianParams, Predictor, max_time_step
+from sacformer_jax.networks import ActorOutput, GaussianParams, max_time_step
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.transformer import Seen
 from sacformer_jax.types import (
@@ -53,7 +53,6 @@ class SACParts(OffPolicyParts):
       initial_alpha: α at the start.
       td_lambda: λ of the critics' targets along a window.
       prediction_weight: of the loss in predicting the next observation, in the actor's; 0: none.
-      critic_foresight: critics see what the actor's prediction makes of an action.
     """
 
     acting_actor: nn.Module
@@ -65,7 +64,6 @@ class SACParts(OffPolicyParts):
     initial_alpha: float
     td_lambda: float
     prediction_weight: float
-    critic_foresight: bool
 
 
 def sac_parts(
@@ -74,23 +72,18 @@ def sac_parts(
     data: DataAxis,
     actor: nn.Module,
     acting_actor: nn.Module | None = None,
-    predictor: Predictor | None = None,
 ) -> SACParts:
     """The parts that a configuration and an environment ask for, around ``actor``."""
-    critics = make_critics(
-        config.critic,
-        config.precision.compute_dtype,
-        config.context.context_length,
-        max_time_step(spec),
-        burn_in=config.context.burn_in,
-    )
-    if config.critic.critic_foresight:
-        assert predictor is not None
-        critics = with_foresight(critics, predictor)
     return SACParts(
         actor=actor,
         acting_actor=acting_actor or actor,
-        critics=critics,
+        critics=make_critics(
+            config.critic,
+            config.precision.compute_dtype,
+            config.context.context_length,
+            max_time_step(spec),
+            burn_in=config.context.burn_in,
+        ),
         distribution=_distribution(config, spec),
         obs_size=spec.obs_size,
         action_size=spec.action_size,
@@ -102,7 +95,6 @@ def sac_parts(
         initial_alpha=config.learning.alpha,
         td_lambda=config.learning.td_lambda,
         prediction_weight=config.learning.prediction_weight,
-        critic_foresight=config.critic.critic_foresight,
         num_critic_features=config.actor.actor_width if config.critic.critic_features else 0,
         normalize_obs=config.context.normalize_obs,
         data=data,

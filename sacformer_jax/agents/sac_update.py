@@ -29,7 +29,7 @@ from sacformer_jax.agents.off_policy import (
     step_weights,
 )
 from sacformer_jax.agents.sac_policy import SACParts, WindowPolicies, window_policies
-from sacformer_jax.critics import CriticInputs, CriticOutlook
+from sacformer_jax.critics import CriticInputs
 from sacformer_jax.networks import GaussianParams
 from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
@@ -225,15 +225,12 @@ def critic_inputs(
         now, following = obs[:, :-1], obs[:, 1:]
     else:
         now, following = obs, parts.normalized(learner.normalizer, window.following.obs)
-    features, outlook = jax.lax.stop_gradient(both.features), None
     if parts.num_critic_features:
-        assert features is not None
-        now = jnp.concatenate([now, features[0]], axis=-1)
-        following = jnp.concatenate([following, features[1]], axis=-1)
-    if parts.critic_foresight:
-        assert features is not None
-        outlook = CriticOutlook({"params": learner.actor_params["params"]["prediction"]}, *features)
-    return CriticInputs(now, following, window.action, window.time_step, window.state_mask, outlook)
+        assert both.features is not None
+        features, next_features = jax.lax.stop_gradient(both.features)
+        now = jnp.concatenate([now, features], axis=-1)
+        following = jnp.concatenate([following, next_features], axis=-1)
+    return CriticInputs(now, following, window.action, window.time_step, window.state_mask)
 
 
 def _update_critics(

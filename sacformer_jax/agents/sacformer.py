@@ -7,7 +7,7 @@ from sacformer_jax.agents.sac_policy import SACParts, sac_parts
 from sacformer_jax.agents.sac_update import make_sac_agent
 from sacformer_jax.config import Config
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.networks import TransformerActor, make_predictor, max_time_step
+from sacformer_jax.networks import TransformerActor, max_time_step
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.transformer import TransformerConfig
 
@@ -54,5 +54,4 @@ def make_parts(config: Config, spec: EnvSpec, data: DataAxis) -> SACParts:
     actor = acting_actor = make_actor(config, spec)
     if config.context.acting_context == "episode":
         acting_actor = actor.clone(context_length=acting_pairs(config, spec), cached=True)
-    predictor = make_predictor(actor.config, spec.obs_size)
-    return sac_parts(config, spec, data, actor, acting_actor, predictor)
+    return sac_parts(config, spec, data, actor, acting_actor)
