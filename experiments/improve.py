@@ -46,6 +46,7 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
     "lambda-no-time": {"td_lambda": 0.5, "time_embedding": "none"},
     "lambda-path-no-time": {"td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256},
+    "larger-path-no-time": {"td_lambda": 0.8, "time_embedding": "none", "state_path_width": 256},
     "lambda-path-predicting": {
         "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
         "prediction_weight": 1.0,
