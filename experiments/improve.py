@@ -51,6 +51,11 @@ TOGETHER: dict[str, dict[str, Any]] = {
         "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
         "prediction_weight": 1.0,
     },
+    # Beside a loss of the actor of some hundred, that of the prediction is some thousandths.
+    "lambda-path-predicting-more": {
+        "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
+        "prediction_weight": 300.0,
+    },
 }  # fmt: skip
 # As many single steps as SAC learns from otherwise, but for four.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
