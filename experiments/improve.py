@@ -46,6 +46,15 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
     "lambda-no-time": {"td_lambda": 0.5, "time_embedding": "none"},
     "lambda-path-no-time": {"td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256},
+    "lambda-path-states": {
+        "td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256,
+        "return_conditioning": "none",
+    },
+    # What else SAC has otherwise: wide heads at first, and as many steps to learn from.
+    "lambda-path-as-sac": {
+        "td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256,
+        "return_conditioning": "none", "head_init_scale": 1.0, "batch_size": 42,
+    },
     "larger-path-no-time": {"td_lambda": 0.8, "time_embedding": "none", "state_path_width": 256},
     "lambda-path-predicting": {
         "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,

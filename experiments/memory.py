@@ -44,6 +44,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "sac-lambda": {
         "agent": "sac", "stack_obs": K, "learnt_steps": K, "batch_size": 42, **_LAMBDA,
     },
+    "sac-lambda-pairs": {
+        "agent": "sac", "stack_obs": 2, "learnt_steps": K, "batch_size": 42, **_LAMBDA,
+    },
     "sac-one-state": {"agent": "sac"},
     # Critics that see no more than the current state.
     "blind-critic": _SEQUENCE,
