@@ -55,6 +55,7 @@ TOGETHER: dict[str, dict[str, Any]] = {
         "td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256,
         "return_conditioning": "none", "head_init_scale": 1.0, "batch_size": 42,
     },
+    "larger-path": {"td_lambda": 0.8, "state_path_width": 256},
     "larger-path-no-time": {"td_lambda": 0.8, "time_embedding": "none", "state_path_width": 256},
     "lambda-path-predicting": {
         "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
@@ -78,7 +79,9 @@ SAC: dict[str, dict[str, Any]] = {
     "sac-lambda-larger": {**_WINDOWS, "td_lambda": 0.8},
     "sac-lambda-norm": {**_WINDOWS, "td_lambda": 0.5, "critic_layer_norm": True},
 }
-FURTHER = ("sacformer", "td-lambda", "lambda-path", "lambda-path-no-time", "sac", "sac-lambda")
+FURTHER = (
+    "sacformer", "lambda-path", "larger-path-no-time", "sac", "sac-lambda", "sac-lambda-larger",
+)  # fmt: skip
 """Variants that are trained on all four tasks."""
 
 
