@@ -18,9 +18,10 @@ from matplotlib.figure import Figure
 from report.curves import grid_figure, panels_figure
 from report.intervals import intervals_figure
 from report.lines import StudyLines, read_study
-from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS
+from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS, normalized
 from report.styles import AGENTS, Style, styles_of
 from report.tables import aggregates, markdown
+from report.timed import scores_within, timed
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 COLUMNS = (
@@ -30,8 +31,17 @@ COLUMNS = (
 Runs = Mapping[str, Sequence[Sequence[float]]]
 
 
-def write(path: Path, runs: Runs, agent: str | None = None, every: int = 1_000) -> Path:
-    """A table of ``{TASK-VARIANT: [returns of seed 0, of seed 1, …]}``."""
+def write(
+    path: Path,
+    runs: Runs,
+    agent: str | None = None,
+    every: int = 1_000,
+    seconds: Mapping[str, float] | None = None,
+) -> Path:
+    """A table of ``{TASK-VARIANT: [returns of seed 0, of seed 1, …]}``.
+
+    ``seconds`` are a run's from one evaluation to the next.
+    """
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -39,8 +49,9 @@ def write(path: Path, runs: Runs, agent: str | None = None, every: int = 1_000) 
             task, variant = run.split("-", 1)
             for seed, returns in enumerate(seeds):
                 for place, value in enumerate(returns, 1):
+                    at = (seconds or {}).get(run, 0.5) * (place - 1)
                     row = (path.stem, run, agent or variant, "cpu", task, "native", seed,
-                           every * place, value, 1.0, 4, 0.5, "abc")  # fmt: skip
+                           every * place, value, 1.0, 4, at, "abc")  # fmt: skip
                     writer.writerow(row)
     return path
 
@@ -181,6 +192,39 @@ def test_a_table_of_markdown(tmp_path: Path) -> None:
         "| SAC | 0.00 [0.00, 0.01] | – | – |",
         "| PPO | -0.01 | -0.01 | 0.00 |",
     ]
+
+
+def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
+    runs = {
+        # Twice as slow as SAC on Hopper, eight times on Walker2d: geometric mean 4.
+        "Hopper-sacformer": [
+            returns_for("Hopper", 0.0, 0.2, 0.3, 0.5, 0.9, 0.9, 0.9, 0.9),
+            returns_for("Hopper", 0.0, 0.2, 0.3, 0.9, 0.9, 0.9, 0.9, 0.9),
+        ],
+        "Walker2d-sacformer": [returns_for("Walker2d", 0.1, *[0.9] * 7)] * 2,
+        "Hopper-sac": [returns_for("Hopper", *[0.3] * 8)] * 2,
+        "Walker2d-sac": [returns_for("Walker2d", *[0.21] * 8)] * 2,
+        "Hopper-ppo": [returns_for("Hopper", *[0.4] * 8)],
+    }
+    seconds = dict.fromkeys(runs, 1.0) | {"Hopper-sacformer": 2.0, "Walker2d-sacformer": 8.0}
+    table = write(tmp_path / "arena-states.csv", runs, seconds=seconds)
+    study = read_study(table)
+    assert study is not None
+    (one,) = timed(study, "sac")  # PPO has another number of seeds
+    assert (one.variant, one.tasks) == ("sacformer", ["Hopper", "Walker2d"])
+    assert one.slowdown == pytest.approx(4.0)
+    # After SAC's 7 seconds: evaluations at 0, 2, 4 and 6 s on Hopper, on Walker2d the first alone.
+    within = scores_within(study.lines["Hopper", "sacformer"], 7.0)
+    assert normalized("Hopper", within) == pytest.approx([0.25, 0.35])
+    assert one.improvement.value == pytest.approx((0.5 + 0.0) / 2)
+    # Trimmed are one at each end: of 0.1, 0.1, 0.25, 0.35, and of 0.21, 0.21, 0.3, 0.3.
+    assert one.difference.value == pytest.approx((0.1 + 0.25) / 2 - (0.21 + 0.3) / 2)
+    figures.draw(table)
+    text = (tmp_path / "arena-states.md").read_text()
+    assert "## At equal wall-clock" in text
+    assert "| SACFormer | 4.00 | -0.08 [" in text
+    figures.draw(write(tmp_path / "figure2-cpu.csv", runs, seconds=seconds))
+    assert "wall-clock" not in (tmp_path / "figure2-cpu.md").read_text()
 
 
 def test_the_table_of_scores(tmp_path: Path) -> None:

@@ -39,12 +39,14 @@ class Line:
       variant: its name.
       agent: the algorithm.
       curves: for each seed, the evaluation return by env steps.
+      seconds: for each seed, those trained until an evaluation, by env steps; NaN if unknown.
     """
 
     task: str
     variant: str
     agent: str
     curves: dict[int, dict[int, float]] = dataclasses.field(default_factory=dict)
+    seconds: dict[int, dict[int, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def seeds(self) -> list[int]:
@@ -139,6 +141,8 @@ def read_study(path: Path) -> StudyLines | None:
         line = lines.setdefault((task, variant), Line(task, variant, row["agent"]))
         curve = line.curves.setdefault(int(row["seed"]), {})
         curve[row["env_steps"]] = row["return_mean"]
+        seconds = line.seconds.setdefault(int(row["seed"]), {})
+        seconds[row["env_steps"]] = float(row.get("wall_s") or "nan")
     if not lines:
         return None
     known = list(REFERENCE_RETURNS)

@@ -31,6 +31,7 @@ from report.scores import (
     normalized,
     probability_of_improvement,
 )
+from report.timed import TIMED, timed
 
 COMPARED_WITH_PUBLISHED = {"baselines"}
 """Studies whose agents are set beside published returns."""
@@ -154,6 +155,13 @@ def markdown(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str
         _about_aggregates(study, baseline),
         _aggregates_table(study, made, baseline),
     ]
+    if study.name in TIMED:
+        parts += [
+            "## At equal wall-clock",
+            f"The same two, with every run stopped after the seconds of training in which "
+            f"{label_of(baseline)} makes all its env steps on the task.",
+            _timed_table(study, baseline),
+        ]
     if study.name in COMPARED_WITH_PUBLISHED:
         parts += [
             "## Beside published returns",
@@ -240,6 +248,19 @@ def _aggregates_table(study: StudyLines, made: Sequence[Aggregate], baseline: st
         rows.append([label_of(one.variant), _bracketed(one.iqm), difference, better])
     name = label_of(baseline)
     return _table(["", "interquartile mean", f"less {name}'s", f"P(better than {name})"], rows)
+
+
+def _timed_table(study: StudyLines, baseline: str) -> str:
+    rows = []
+    for one in timed(study, baseline):
+        better = _bracketed(one.improvement)
+        if one.tasks != study.tasks:
+            better += f" on {', '.join(one.tasks)} only"
+        difference = _bracketed(one.difference)
+        rows.append([label_of(one.variant), f"{one.slowdown:.2f}", difference, better])
+    name = label_of(baseline)
+    head = ["", f"seconds, {name}'s = 1", f"interquartile mean less {name}'s"]
+    return _table([*head, f"P(better than {name})"], rows)
 
 
 def _bracketed(estimate: Estimate | None) -> str:
