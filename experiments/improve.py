@@ -77,6 +77,7 @@ SAC: dict[str, dict[str, Any]] = {
     # The same returns along windows, without a transformer: 42 windows of 6 for 256 single steps.
     "sac-lambda": {**_WINDOWS, "td_lambda": 0.5},
     "sac-lambda-larger": {**_WINDOWS, "td_lambda": 0.8},
+    "sac-lambda-larger-small-heads": {**_WINDOWS, "td_lambda": 0.8, "head_init_scale": 0.01},
     "sac-lambda-norm": {**_WINDOWS, "td_lambda": 0.5, "critic_layer_norm": True},
 }
 FURTHER = (
