@@ -13,6 +13,7 @@ import figures
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from report.curves import grid_figure, panels_figure
@@ -207,7 +208,7 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
         "Hopper-ppo": [returns_for("Hopper", *[0.4] * 8)],
     }
     seconds = dict.fromkeys(runs, 1.0) | {"Hopper-sacformer": 2.0, "Walker2d-sacformer": 8.0}
-    table = write(tmp_path / "arena-states.csv", runs, seconds=seconds)
+    table = write(tmp_path / "arena.csv", runs, seconds=seconds)
     study = read_study(table)
     assert study is not None
     (one,) = timed(study, "sac")  # PPO has another number of seeds
@@ -220,7 +221,7 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
     # Trimmed are one at each end: of 0.1, 0.1, 0.25, 0.35, and of 0.21, 0.21, 0.3, 0.3.
     assert one.difference.value == pytest.approx((0.1 + 0.25) / 2 - (0.21 + 0.3) / 2)
     figures.draw(table)
-    text = (tmp_path / "arena-states.md").read_text()
+    text = (tmp_path / "arena.md").read_text()
     assert "## At equal wall-clock" in text
     assert "| SACFormer | 4.00 | -0.08 [" in text
     figures.draw(write(tmp_path / "figure2-cpu.csv", runs, seconds=seconds))
@@ -270,6 +271,25 @@ def test_many_variants_have_a_row_each(tmp_path: Path) -> None:
         assert line_of(row[1], MANY[place])[1][1] == pytest.approx(expected[0])
         assert line_of(row[2], MANY[place])[1][1] == pytest.approx(0.1 * place + 0.01)
         assert line_of(row[2], "SACFormer")[1][1] == pytest.approx(0.01)
+
+
+def test_many_variants_on_many_tasks_leave_room_for_each_other(tmp_path: Path) -> None:
+    long = ["sacformer", "sac", *(f"a-change-with-a-long-name-{letter}" for letter in "abcdefg")]
+    study = read(tmp_path / "study.csv", {
+        f"{task}-{variant}": [returns_for(task, 0.0, 0.5), returns_for(task, 0.1, 0.6)]
+        for task in REFERENCE_RETURNS for variant in long
+        if (task, variant) != ("Ant", "sacformer")
+    })  # fmt: skip
+    figure = grid_figure(study, "sac")
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    texts = [axes.title for axes in figure.axes] + [axes.xaxis.label for axes in figure.axes]
+    boxes = [text.get_window_extent(renderer) for text in texts if text.get_text()]
+    assert len(boxes) == len(REFERENCE_RETURNS) + 1 + 1  # titles, the average's, one of the axes
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    assert all(box.x0 >= 0 and box.x1 <= figure.bbox.x1 for box in boxes)
+    assert caption_of(figure).endswith("Empty panels: not begun.")
 
 
 def test_intervals_are_sorted(tmp_path: Path) -> None:

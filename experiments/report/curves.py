@@ -6,6 +6,7 @@ Nothing is smoothed. A line goes as far as all its seeds were evaluated.
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from report.lines import Line, StudyLines, label_of
 from report.page import make_page, tidy
 from report.scores import REFERENCE_SOURCE, Estimate, iqm_estimate, mean_estimate, normalized
 from report.styles import AGENTS, Style, styles_of
-from report.tables import facts, rated_tasks, unfinished
+from report.tables import facts, in_progress, not_begun, rated_tasks, unfinished
 
 SEEDS_FOR_INTERVAL = 5
 """Seeds from which on a band is a bootstrap interval; of fewer it is their range."""
@@ -33,6 +34,10 @@ _PANEL_HEIGHT, _ONLY_PANEL_HEIGHT = 1.9, 2.8
 _ROW_HEIGHT, _ROWS_HEIGHT = 0.85, 8.6
 """Of a variant's row, at most, and of all rows of a page, at most."""
 _AVERAGE = "IQM over tasks"
+_LABEL_CHARACTERS = 16
+"""Of a variant's name in a line beside its panels."""
+_MOST_WORDY = 4
+"""Columns up to which there is room for more than the task's name above each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,9 +120,10 @@ def grid_figure(study: StudyLines, baseline: str) -> Figure:
     ]
     page = make_page(
         len(variants), len(titles), min(_ROW_HEIGHT, _ROWS_HEIGHT / len(variants)),
-        _caption(study, averages), handles,
+        _caption(study, averages, in_panels=True), handles,
         sharex="all", sharey="col",
     )  # fmt: skip
+    crowded = len(titles) > _MOST_WORDY
     for row, variant in zip(page.axes, variants, strict=True):
         for axes, title in zip(row, titles, strict=True):
             for name, style in ((baseline, _GREY), (variant, _BLACK)):
@@ -126,10 +132,15 @@ def grid_figure(study: StudyLines, baseline: str) -> Figure:
                     _plot(axes, curve, style, study, label_of(name), band=name == variant)
             _finish(axes, study)
             axes.yaxis.set_major_locator(MaxNLocator(3))
-        row[0].set_ylabel(label_of(variant), rotation=0, ha="right", va="center", fontweight="bold")
+        name = "\n".join(textwrap.wrap(label_of(variant), _LABEL_CHARACTERS))
+        row[0].set_ylabel(name, rotation=0, ha="right", va="center", fontweight="bold")
     for axes, title in zip(page.axes[0], titles, strict=True):
-        axes.set_title(title if title == _AVERAGE else f"{title}, return")
-    for axes in page.axes[-1]:
+        if crowded:
+            axes.set_title(title.removesuffix(" over tasks"))
+        else:
+            axes.set_title(title if title == _AVERAGE else f"{title}, return")
+    last = page.axes[-1]
+    for axes in [last[len(last) // 2]] if crowded else last:
         axes.set_xlabel(_steps_label(study))
     return page.figure
 
@@ -194,7 +205,8 @@ def _value_label(title: str) -> str:
     return "normalized score" if title == _AVERAGE else "evaluation return"
 
 
-def _caption(study: StudyLines, averages: dict[str, _Curve]) -> str:
+def _caption(study: StudyLines, averages: dict[str, _Curve], in_panels: bool = False) -> str:
+    """``in_panels``: every line has a panel, which is empty where it has not begun."""
     text = f"Study {study.name}: {facts(study)}. Lines: mean over seeds, not smoothed."
     seeds = {len(line.seeds) for line in study.lines.values()}
     if any(1 < number < SEEDS_FOR_INTERVAL for number in seeds):
@@ -211,7 +223,9 @@ def _caption(study: StudyLines, averages: dict[str, _Curve]) -> str:
         )
         text += ", band 95 % stratified bootstrap." if max(seeds) > 1 else "."
         missing = [label_of(name) for name in study.variants if name not in averages]
-        if missing:
+        if missing and not in_panels:
             text += f" Without {', '.join(missing)}, not begun on every task."
-    waiting = unfinished(study)
+    if in_panels and not_begun(study):
+        text += " Empty panels: not begun."
+    waiting = in_progress(study) if in_panels else unfinished(study)
     return text + (f" Not finished: {'; '.join(waiting)}." if waiting else "")

@@ -189,14 +189,27 @@ def facts(study: StudyLines) -> str:
 
 def unfinished(study: StudyLines) -> list[str]:
     """Lines in progress or not begun: ``SAC on Ant (40,000 env steps)``."""
+    return not_begun(study) + in_progress(study)
+
+
+def not_begun(study: StudyLines) -> list[str]:
+    """Tasks that a variant has no line of: ``SAC on Hopper, Ant (not begun)``."""
     told = []
     for variant in study.variants:
-        for task in study.tasks:
-            if not study.finished(task, variant):
-                line = study.lines.get((task, variant))
-                where = f"{line.last_step:,} env steps" if line else "not begun"
-                told.append(f"{label_of(variant)} on {task} ({where})")
+        tasks = [task for task in study.tasks if (task, variant) not in study.lines]
+        if tasks:
+            told.append(f"{label_of(variant)} on {', '.join(tasks)} (not begun)")
     return told
+
+
+def in_progress(study: StudyLines) -> list[str]:
+    """Lines that are shorter than the study's: ``SAC on Ant (40,000 env steps)``."""
+    return [
+        f"{label_of(variant)} on {task} ({study.lines[task, variant].last_step:,} env steps)"
+        for variant in study.variants
+        for task in study.tasks
+        if (task, variant) in study.lines and not study.finished(task, variant)
+    ]
 
 
 def _unfinished(study: StudyLines) -> list[str]:
