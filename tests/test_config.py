@@ -183,6 +183,19 @@ def test_preset_authors_holds_their_programs_values() -> None:
     assert {name for name in sac if sac[name] != paper[name]} == {"preset"}
 
 
+def test_preset_best_changes_only_what_was_tuned() -> None:
+    changed = {
+        "sacformer": {"td_lambda": 0.5, "state_path_width": 256},
+        "sac": {"td_lambda": 0.5, "learnt_steps": 6, "batch_size": 42},
+        "td3": {}, "ddpg": {}, "ppo": {},
+    }  # fmt: skip
+    for agent, values in changed.items():
+        best = Config.from_preset("best", agent=agent, env="Ant").flat()
+        cpu = Config.from_preset("cpu", agent=agent, env="Ant").flat()
+        expected = {"preset": "best", "total_env_steps": 100_000, **values}
+        assert {name: best[name] for name in best if best[name] != cpu[name]} == expected
+
+
 @pytest.mark.parametrize("agent", ["td3", "ddpg"])
 def test_preset_paper_runs_the_deterministic_agents_as_cleanrl(agent: str) -> None:
     flat = Config.from_preset("paper", agent=agent, env="Hopper").flat()
