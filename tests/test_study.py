@@ -208,6 +208,27 @@ def test_the_agents_are_compared_on_the_same_task(name: str, arguments: tuple[st
     assert {config.agent for config in study.configs.values()} == {"sacformer", "sac"}
 
 
+def test_the_arena_is_fair_and_its_seeds_are_fresh() -> None:
+    configs = importlib.import_module("arena").study().configs
+    same = (
+        "total_env_steps", "updates_per_env_step", "num_envs", "eval_every", "eval_episodes",
+    )  # fmt: skip
+    for field in same:
+        assert len({config.flat()[field] for config in configs.values()}) == 1, field
+    tuned = {
+        seed
+        for arguments in (("improve",), ("memory", "hidden"), ("memory", "delay"))
+        for config in importlib.import_module(arguments[0]).study(*arguments[1:]).configs.values()
+        for seed in config.all_seeds
+    }
+    for task in ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid"):
+        own, opponent = configs[f"{task}-sacformer"], configs[f"{task}-sac"]
+        assert (own.preset, opponent.preset) == ("best", "best")
+        assert own.all_seeds == opponent.all_seeds
+        assert len(own.all_seeds) >= 5
+        assert not tuned & set(own.all_seeds)
+
+
 def test_the_studies_are_those_of_the_paper() -> None:
     runs = {name: set(importlib.import_module(name).study("full").configs) for name in SCRIPTS}
     agents, tasks = (

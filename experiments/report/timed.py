@@ -20,7 +20,7 @@ from report.scores import (
     run_scores,
 )
 
-TIMED = {"arena-states", "arena-hidden", "arena-delay"}
+TIMED = {"arena"}
 """Studies whose runs had a core each."""
 
 
