@@ -40,41 +40,35 @@ SACFORMER: dict[str, dict[str, Any]] = {
     # What the upper blocks have heard of is kept in acting, as training shows it.
     "burn-in": {"burn_in": K - 1, "acting_context": "episode", "acting_context_limit": K},
 }
+_LAMBDA_PATH: dict[str, Any] = {"td_lambda": 0.5, "state_path_width": 256}
+_LARGER_PATH: dict[str, Any] = {**_LAMBDA_PATH, "td_lambda": 0.8}
+_NO_TIME: dict[str, Any] = {"time_embedding": "none"}
+_STATES: dict[str, Any] = {**_NO_TIME, "return_conditioning": "none"}
 TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
-    "lambda-path": {"td_lambda": 0.5, "state_path_width": 256},
-    "lambda-path-norm": {"td_lambda": 0.5, "state_path_width": 256, "critic_layer_norm": True},
-    "lambda-no-time": {"td_lambda": 0.5, "time_embedding": "none"},
-    "lambda-path-no-time": {"td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256},
-    "lambda-path-states": {
-        "td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256,
-        "return_conditioning": "none",
-    },
+    "lambda-path": _LAMBDA_PATH,
+    "lambda-path-norm": {**_LAMBDA_PATH, "critic_layer_norm": True},
+    "lambda-no-time": {"td_lambda": 0.5, **_NO_TIME},
+    "lambda-path-no-time": {**_LAMBDA_PATH, **_NO_TIME},
+    "lambda-path-states": {**_LAMBDA_PATH, **_STATES},
     # What else SAC has otherwise: wide heads at first, and as many steps to learn from.
-    "lambda-path-as-sac": {
-        "td_lambda": 0.5, "time_embedding": "none", "state_path_width": 256,
-        "return_conditioning": "none", "head_init_scale": 1.0, "batch_size": 42,
-    },
-    "larger-path": {"td_lambda": 0.8, "state_path_width": 256},
-    "larger-path-no-time": {"td_lambda": 0.8, "time_embedding": "none", "state_path_width": 256},
-    "lambda-path-predicting": {
-        "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
-        "prediction_weight": 1.0,
-    },
+    "lambda-path-as-sac": {**_LAMBDA_PATH, **_STATES, "head_init_scale": 1.0, "batch_size": 42},
+    "larger-path": _LARGER_PATH,
+    "larger-path-no-time": {**_LARGER_PATH, **_NO_TIME},
+    "lambda-path-predicting": {**_LAMBDA_PATH, "critic_features": True, "prediction_weight": 1.0},
     # Beside a loss of the actor of some hundred, that of the prediction is some thousandths.
     "lambda-path-predicting-more": {
-        "td_lambda": 0.5, "state_path_width": 256, "critic_features": True,
-        "prediction_weight": 300.0,
+        **_LAMBDA_PATH, "critic_features": True, "prediction_weight": 300.0,
     },
 }  # fmt: skip
-# As many single steps as SAC learns from otherwise, but for four.
+# 42 windows of 6 for 256 single steps.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
 SAC: dict[str, dict[str, Any]] = {
     "sac": {},
     "sac-critic-norm": {"critic_layer_norm": True},
     "sac-slower-critic": {"critic_learning_rate": 3e-4},
     "sac-faster-actor": {"actor_learning_rate": 1e-3},
-    # The same returns along windows, without a transformer: 42 windows of 6 for 256 single steps.
+    # The same returns along windows, without a transformer.
     "sac-lambda": {**_WINDOWS, "td_lambda": 0.5},
     "sac-lambda-larger": {**_WINDOWS, "td_lambda": 0.8},
     "sac-lambda-larger-small-heads": {**_WINDOWS, "td_lambda": 0.8, "head_init_scale": 0.01},

@@ -6,8 +6,8 @@ python experiments/memory.py --arena delay --jobs 2   # actions come into effect
 Preset `cpu`, 60,000 env steps, seeds 0 to 2 in one program. SAC sees the last K observations with
 the actions between them; SACFormer the same history, as K pairs with its own actions among them.
 Return-to-go tells of the reward and so of the velocity: none of these has it, but one. Both agents
-have the λ-returns along windows which improve.py shows to help both, SACFormer beside them relative
-positions, as the embedding of the time step was seen to be noise.
+have variants with the λ-returns along windows which improve.py shows to help both, SACFormer beside
+them with relative positions, as the embedding of the time step was seen to be noise.
 """
 
 from __future__ import annotations
@@ -35,36 +35,28 @@ _WHOLE_PAST: dict[str, Any] = {
     "acting_context": "episode",
     "acting_context_limit": K,
 }
-_LAMBDA: dict[str, Any] = {"td_lambda": 0.5}
 _LAMBDA_SEQUENCE: dict[str, Any] = {
-    **_SEQUENCE, **_WHOLE_PAST, **_LAMBDA, "time_embedding": "rotary",
+    **_SEQUENCE, **_WHOLE_PAST, "td_lambda": 0.5, "time_embedding": "rotary",
 }  # fmt: skip
+_LAMBDA_SAC: dict[str, Any] = {
+    "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
+}  # fmt: skip
+_PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
 VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"agent": "sac", "stack_obs": K},
-    "sac-lambda": {
-        "agent": "sac", "stack_obs": K, "learnt_steps": K, "batch_size": 42, **_LAMBDA,
-    },
-    "sac-lambda-pairs": {
-        "agent": "sac", "stack_obs": 2, "learnt_steps": K, "batch_size": 42, **_LAMBDA,
-    },
+    "sac-lambda": {**_LAMBDA_SAC, "stack_obs": K},
+    "sac-lambda-pairs": {**_LAMBDA_SAC, "stack_obs": 2},
     "sac-one-state": {"agent": "sac"},
     # Critics that see no more than the current state.
     "blind-critic": _SEQUENCE,
     "critic-features": {**_SEQUENCE, "critic_features": True},
-    "predicting-features": {**_SEQUENCE, "critic_features": True, "prediction_weight": 1.0},
+    "predicting-features": {**_SEQUENCE, **_PREDICTED},
     "critic-history": {**_SEQUENCE, **_WHOLE_PAST, "critic_history": K},
     "lambda-history": {**_LAMBDA_SEQUENCE, "critic_history": K},
-    "lambda-predicting": {
-        **_LAMBDA_SEQUENCE, "critic_features": True, "prediction_weight": 1.0,
-    },
-    "lambda-predicting-path": {
-        **_LAMBDA_SEQUENCE, "critic_features": True, "prediction_weight": 1.0,
-        "state_path_width": 256,
-    },
-    "with-return": {
-        "tokens": "gsa", "critic_features": True, "prediction_weight": 1.0,
-    },
-}  # fmt: skip
+    "lambda-predicting": {**_LAMBDA_SEQUENCE, **_PREDICTED},
+    "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **_PREDICTED, "state_path_width": 256},
+    "with-return": {"tokens": "gsa", **_PREDICTED},
+}
 
 
 def study(arena: str) -> Study:

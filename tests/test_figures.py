@@ -13,7 +13,6 @@ import figures
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from report.curves import grid_figure, panels_figure
@@ -280,12 +279,11 @@ def test_many_variants_on_many_tasks_leave_room_for_each_other(tmp_path: Path) -
         for task in REFERENCE_RETURNS for variant in long
         if (task, variant) != ("Ant", "sacformer")
     })  # fmt: skip
-    figure = grid_figure(study, "sac")
-    FigureCanvasAgg(figure)
-    figure.draw_without_rendering()
-    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    with figures.matplotlib.rc_context(figures.FONTS):
+        figure = grid_figure(study, "sac")
+        figures.FigureCanvasAgg(figure).draw()
     texts = [axes.title for axes in figure.axes] + [axes.xaxis.label for axes in figure.axes]
-    boxes = [text.get_window_extent(renderer) for text in texts if text.get_text()]
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
     assert len(boxes) == len(REFERENCE_RETURNS) + 1 + 1  # titles, the average's, one of the axes
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
     assert all(box.x0 >= 0 and box.x1 <= figure.bbox.x1 for box in boxes)

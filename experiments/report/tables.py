@@ -31,7 +31,7 @@ from report.scores import (
     normalized,
     probability_of_improvement,
 )
-from report.timed import TIMED, timed
+from report.timed import TIMED, Timed, timed
 
 COMPARED_WITH_PUBLISHED = {"baselines"}
 """Studies whose agents are set beside published returns."""
@@ -158,7 +158,7 @@ def markdown(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str
     if study.name in TIMED:
         parts += [
             "## At equal wall-clock",
-            f"The same two, with every run stopped after the seconds of training in which "
+            "The same two, with every run stopped after the seconds of training in which "
             f"{label_of(baseline)} makes all its env steps on the task.",
             _timed_table(study, baseline),
         ]
@@ -254,11 +254,7 @@ def _about_aggregates(study: StudyLines, baseline: str) -> str:
 def _aggregates_table(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str:
     rows = []
     for one in made:
-        better = _bracketed(one.improvement)
-        if one.improvement is not None and one.tasks != study.tasks:
-            better += f" on {', '.join(one.tasks)} only"
-        difference = _bracketed(one.difference)
-        rows.append([label_of(one.variant), _bracketed(one.iqm), difference, better])
+        rows.append([label_of(one.variant), _bracketed(one.iqm), *_compared(study, one)])
     name = label_of(baseline)
     return _table(["", "interquartile mean", f"less {name}'s", f"P(better than {name})"], rows)
 
@@ -266,14 +262,18 @@ def _aggregates_table(study: StudyLines, made: Sequence[Aggregate], baseline: st
 def _timed_table(study: StudyLines, baseline: str) -> str:
     rows = []
     for one in timed(study, baseline):
-        better = _bracketed(one.improvement)
-        if one.tasks != study.tasks:
-            better += f" on {', '.join(one.tasks)} only"
-        difference = _bracketed(one.difference)
-        rows.append([label_of(one.variant), f"{one.slowdown:.2f}", difference, better])
+        rows.append([label_of(one.variant), f"{one.slowdown:.2f}", *_compared(study, one)])
     name = label_of(baseline)
     head = ["", f"seconds, {name}'s = 1", f"interquartile mean less {name}'s"]
     return _table([*head, f"P(better than {name})"], rows)
+
+
+def _compared(study: StudyLines, one: Aggregate | Timed) -> tuple[str, str]:
+    """Difference from the baseline, and probability of improvement with the tasks it is of."""
+    better = _bracketed(one.improvement)
+    if one.improvement is not None and one.tasks != study.tasks:
+        better += f" on {', '.join(one.tasks)} only"
+    return _bracketed(one.difference), better
 
 
 def _bracketed(estimate: Estimate | None) -> str:

@@ -47,31 +47,24 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
     """Of every variant that has a task to be compared on, in their order."""
     made = []
     for variant in study.variants:
-        tasks = [
-            task
-            for task in study.finished_tasks(variant)
-            if can_normalize(task) and study.finished(task, baseline)
-        ]
-        pairs = {task: (study.lines[task, variant], study.lines[task, baseline]) for task in tasks}
-        # All seeds of a run are one program: of other numbers of seeds, times say nothing.
-        pairs = {task: (a, b) for task, (a, b) in pairs.items() if len(a.seeds) == len(b.seeds)}
-        if variant == baseline or not pairs:
-            continue
-        limits = {task: total_seconds(base) for task, (_, base) in pairs.items()}
-        slowdowns = [total_seconds(own) / limits[task] for task, (own, _) in pairs.items()]
-        of = [
-            normalized(task, scores_within(own, limits[task])) for task, (own, _) in pairs.items()
-        ]
-        over = [normalized(task, base.scores) for task, (_, base) in pairs.items()]
-        made.append(
-            Timed(
-                variant,
-                float(np.exp(np.mean(np.log(slowdowns)))),
-                iqm_difference(of, over),
-                probability_of_improvement(of, over),
-                list(pairs),
-            )
-        )
+        tasks, slowdowns, of, over = [], [], [], []
+        for task in study.finished_tasks(variant):
+            if variant == baseline or not (can_normalize(task) and study.finished(task, baseline)):
+                continue
+            own, base = study.lines[task, variant], study.lines[task, baseline]
+            # All seeds of a run are one program: of other numbers of seeds, times say nothing.
+            if len(own.seeds) != len(base.seeds):
+                continue
+            limit = total_seconds(base)
+            tasks.append(task)
+            slowdowns.append(total_seconds(own) / limit)
+            of.append(normalized(task, scores_within(own, limit)))
+            over.append(normalized(task, base.scores))
+        if tasks:
+            slowdown = float(np.exp(np.mean(np.log(slowdowns))))
+            difference = iqm_difference(of, over)
+            improvement = probability_of_improvement(of, over)
+            made.append(Timed(variant, slowdown, difference, improvement, tasks))
     return made
 
 
