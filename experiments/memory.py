@@ -42,6 +42,9 @@ _LAMBDA_SAC: dict[str, Any] = {
     "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
 }  # fmt: skip
 _PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
+_BELIEF: dict[str, Any] = {
+    **_PREDICTED, "transformer_loss": "prediction", "state_path_width": 256,
+}  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"agent": "sac", "stack_obs": K},
     "sac-lambda": {**_LAMBDA_SAC, "stack_obs": K},
@@ -55,6 +58,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "lambda-history": {**_LAMBDA_SEQUENCE, "critic_history": K},
     "lambda-predicting": {**_LAMBDA_SEQUENCE, **_PREDICTED},
     "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **_PREDICTED, "state_path_width": 256},
+    "belief": {**_LAMBDA_SEQUENCE, **_BELIEF},
     "with-return": {"tokens": "gsa", **_PREDICTED},
 }
 

@@ -30,6 +30,7 @@ PolicyKind = Literal["gaussian", "deterministic"]
 KernelInit = Literal["lecun", "xavier"]
 CriticName = Literal["mlp", "transformer"]
 TimeEmbedding = Literal["absolute", "rotary", "none"]
+TransformerLoss = Literal["policy", "prediction"]
 Activation = Literal["relu", "gelu", "tanh", "silu"]
 
 
@@ -181,6 +182,9 @@ class ActorConfig:
     state_path_width: int = 0
     """Width of an MLP of two layers from the newest state to the heads, around the transformer,
     whose part starts at zero; 0: none (sacformer)."""
+    transformer_loss: TransformerLoss = "policy"
+    """What the transformer learns from: the actor's loss, that of its prediction in it; or the
+    prediction alone, its features then given to the MLP of state_path_width (sacformer)."""
     head_init_scale: float = 1.0
     """Gain of the heads' initialization: Xavier-uniform, of ppo's mean orthogonal."""
 
@@ -240,7 +244,8 @@ class LearningConfig:
     discount: float = 0.99
     """Discount factor γ."""
     prediction_weight: float = 0.0
-    """Weight of the actor's loss in predicting the next observation (sacformer); 0: it does not."""
+    """Weight of the loss in predicting the next observation and the reward, as a share of their
+    variance, in the actor's (sacformer); 0: it does not."""
     td_lambda: float = 0.0
     """λ of the critics' targets along a window: 0 for one step, towards 1 for all that follow."""
     tau: float = 0.005

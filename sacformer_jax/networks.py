@@ -57,8 +57,8 @@ class ActorOutput:
       gaussian: the action distributions.
       seen: what the actor's next call may take as its past; empty for one that sees one state.
       features: of the trunk at the states, ``[..., D]``; None of an actor without one.
-      prediction: what it expects the next state to be more than this one, ``[..., O]`` normalized,
-        under the action that was taken; None of an actor that predicts nothing.
+      prediction: what it expects of the action that was taken, ``[..., O + 1]``: how the
+        normalized observation changes, and the reward; None of an actor that predicts nothing.
     """
 
     gaussian: GaussianParams
@@ -136,7 +136,9 @@ class TransformerActor(nn.Module):
       state_path: widths of an MLP on the state alone, whose features go to the heads, those of the
         trunk added to them by a layer that starts at zero: the policy starts as SAC's, and learns
         what the past has to add (a residual path around the trunk). None: the trunk alone.
-      predicts: say, of states and the actions taken there, which state follows.
+      predicts: say, of states and the actions taken there, which state and reward follow.
+      given: the trunk learns nothing from what is done with its features; ``state_path``, which
+        there must be, sees them beside the state.
       cached: act on an episode step by step: keys and values of the K newest steps are kept in
         the collection ``"cache"`` (which must be mutable) instead of being computed again.
     """
@@ -149,6 +151,7 @@ class TransformerActor(nn.Module):
     tokens: Tokens = "gs"
     state_path: Sequence[int] | None = None
     predicts: bool = False
+    given: bool = False
     cached: bool = False
 
     @nn.compact
@@ -189,19 +192,22 @@ class TransformerActor(nn.Module):
             features, seen = self._features(step, time_step, state_mask, deterministic, past)
         prediction = None
         if self.predicts and not self.cached:
-            prediction = self._predicted(features, action, obs.shape[-1])
-        output = features
+            prediction = self._predicted(features, action, obs.shape[-1] + 1)
+        output = jax.lax.stop_gradient(features) if self.given else features
         if self.state_path is not None:
             newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
             activation, dtype = self.config.activation, self.config.dtype
-            by_state = MLP(self.state_path, activation, dtype=dtype, name="state_path")(newest)
-            zeros = nn.initializers.zeros
-            output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(features)
+            path = MLP(self.state_path, activation, dtype=dtype, name="state_path")
+            if self.given:
+                output = path(jnp.concatenate([newest, output], axis=-1))
+            else:
+                by_state, zeros = path(newest), nn.initializers.zeros
+                output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(output)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(output), seen, features, prediction)
 
     def _predicted(self, features: jax.Array, action: jax.Array, size: int) -> jax.Array:
-        """How the state changes under the actions taken, ``[B, T, O]``."""
+        """What the actions taken lead to, ``[B, T, size]``."""
         cfg = self.config
         both = jnp.concatenate([features, action], axis=-1)
         widths = (_PREDICTION_RATIO * cfg.width,)

@@ -112,6 +112,11 @@ def _check_actor(config: Config) -> None:
             "prediction_weight=0, or agent=sacformer",
         )
         _require(
+            actor.transformer_loss == "policy",
+            f"transformer_loss={actor.transformer_loss!r}: agent={config.agent} has no "
+            "transformer; use transformer_loss=policy, or agent=sacformer",
+        )
+        _require(
             not config.critic.critic_features,
             f"critic_features=True: agent={config.agent} has no transformer whose features critics "
             "could see; use critic_features=False, or agent=sacformer",
@@ -132,6 +137,16 @@ def _check_actor(config: Config) -> None:
             "or agent=sacformer",
         )
     else:
+        for name, value in (
+            ("prediction_weight", config.learning.prediction_weight),
+            ("state_path_width", actor.state_path_width),
+        ):
+            _require(
+                actor.transformer_loss == "policy" or value > 0,
+                f"transformer_loss={actor.transformer_loss!r}: needs a prediction to learn from "
+                f"and an MLP that sees the features, and {name}={value}; use {name} above 0, or "
+                "transformer_loss=policy",
+            )
         _require(
             actor.actor_width % actor.actor_heads == 0,
             f"actor_heads={actor.actor_heads}: must divide actor_width={actor.actor_width}",

@@ -33,6 +33,9 @@ from sacformer_jax.critics import CriticInputs
 from sacformer_jax.networks import GaussianParams
 from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
+_LEAST_VARIANCE = 1e-4
+"""Taken for the variance of what hardly ever changes, that its noise is not learnt."""
+
 
 def bellman_target(
     reward: jax.Array,
@@ -130,7 +133,8 @@ class _Half:
       inputs: of the critics.
       weights: of the steps.
       gaussian: π at the steps.
-      prediction: how observations change after them, ``[B, K, O]``; None if not predicted.
+      prediction: how observations change after them, and the rewards, ``[B, K, O + 1]``; None if
+        not predicted.
       pull_back: takes gradients of ``gaussian`` and ``prediction`` to the actor's parameters.
       noise: standard normal ``[B, K, A]``, for the actor's loss.
     """
@@ -300,10 +304,10 @@ def _update_actor(
 
 @dataclasses.dataclass(frozen=True)
 class _Predicted:
-    """How well the next observations were foretold.
+    """How well the next steps were foretold.
 
     Attributes:
-      grads: of the weighted loss to the prediction ``[B, K, O]``; None if there is none.
+      grads: of the weighted loss to the prediction ``[B, K, O + 1]``; None if there is none.
       metrics: its metrics.
     """
 
@@ -312,19 +316,29 @@ class _Predicted:
 
 
 def _learn_to_predict(parts: SACParts, half: _Half, window: Window) -> _Predicted:
-    """Half the squared error of the predicted change of an observation, mean over its numbers;
-    steps weigh as in the critics' loss, those whose next observation is not known nothing.
+    """The squared error in predicting the change of an observation and the reward, as a share of
+    their variance in the batch, mean over the numbers.
+
+    What moves little from step to step counts as much as what moves far: in differences of
+    positions is the velocity. Steps weigh as in the critics' loss, those whose next observation is
+    not known nothing.
     """
     if half.prediction is None:
         return _Predicted(None, {})
     size, following = parts.obs_size, window.following
     known = window.state_mask[:, 1:] if following is None else following.mask
-    weight = half.weights.critic * known
+    weight = (half.weights.critic * known)[..., None]
     change = half.inputs.next_obs[..., :size] - half.inputs.obs[..., :size]
+    outcome = jnp.concatenate([change, window.reward[..., None]], axis=-1)  # [B, K, O + 1]
+    total, first, second = parts.data.sum(
+        tuple(jnp.sum(weight * x, axis=(0, 1)) for x in (jnp.ones(()), outcome, outcome**2))
+    )
+    total = jnp.maximum(total, _LEAST_VARIANCE)
+    variance = jnp.maximum(second / total - (first / total) ** 2, _LEAST_VARIANCE)
 
     def loss(prediction: jax.Array) -> jax.Array:
-        each = 0.5 * jnp.mean((prediction - change) ** 2, axis=-1)
-        return jnp.sum(weight * each)
+        share = jnp.mean((prediction - outcome) ** 2 / variance, axis=-1, keepdims=True)
+        return jnp.sum(weight * share)
 
     value, grads = jax.value_and_grad(loss)(half.prediction)
     return _Predicted(parts.prediction_weight * grads, {"prediction_loss": value})

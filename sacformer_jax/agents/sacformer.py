@@ -33,6 +33,7 @@ def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
         tokens=config.context.tokens,
         state_path=(settings.state_path_width,) * 2 if settings.state_path_width else None,
         predicts=config.learning.prediction_weight > 0,
+        given=settings.transformer_loss == "prediction",
     )
 
 
