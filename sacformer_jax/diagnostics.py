@@ -57,7 +57,7 @@ PANELS = (
     Panel("train", "learning_rate", "learning rate", "step size"),
     Panel("train", "critic_loss", "critic loss", "squared error", log=True),
     Panel("train", "actor_loss", "actor loss", "loss"),
-    Panel("train", "prediction_loss", "prediction loss", "squared error", log=True),
+    Panel("train", "prediction_loss", "prediction loss", "share of variance", log=True),
     Panel("train", "critic_grad_norm", "critic gradient", "norm", log=True),
     Panel("train", "actor_grad_norm", "actor gradient", "norm", log=True),
     Panel("train", "skipped_updates", "updates skipped so far", "updates", total=True),

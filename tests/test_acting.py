@@ -95,6 +95,7 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
         ACT, band, spec.max_episode_steps + 1 if settings.time_embedding == "absolute" else None,
         1.0, config.context.tokens,
         (settings.state_path_width,) * 2 if settings.state_path_width else None,
+        given=settings.transformer_loss == "prediction",
     )  # fmt: skip
     steps = len(obs)
     so_far = np.concatenate([[0.0], np.cumsum(rewards[: steps - 1], dtype=np.float32)])
@@ -118,6 +119,16 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
         ("gs", 1000, {}),
         pytest.param("gsa", 1000, {}, marks=pytest.mark.slow),
         ("gsa", 100, {"time_embedding": "rotary", "state_path_width": 8}),
+        pytest.param(
+            "gsa",
+            100,
+            {
+                "state_path_width": 8,
+                "transformer_loss": "prediction",
+                "prediction_weight": 1.0,
+            },
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_thousand_steps_equal_full_recomputation(tokens, limit, fields):

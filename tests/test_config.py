@@ -433,8 +433,11 @@ BAD: list[tuple[dict[str, Any], str]] = [
             {"state_path_width": 8},
             {"prediction_weight": 1.0},
             {"critic_features": True},
+            {"transformer_loss": "prediction"},
         )
     ),
+    ({"transformer_loss": "prediction"}, "prediction_weight=0.0"),
+    ({"transformer_loss": "prediction", "prediction_weight": 1.0}, "state_path_width=0"),
     ({"prediction_weight": -1.0}, "prediction_weight=-1.0"),
     ({"critic_features": True, "critic": "transformer"}, "critic=mlp"),
     ({"critic_features": True, "critic_history": 2}, "critic_history=1"),
