@@ -1,10 +1,14 @@
-"""Run by test_mesh.py in a process with 8 CPU devices: what it finds, as JSON."""
+"""Run by test_mesh.py in a process with 8 CPU devices: what it finds, as JSON.
+
+python mesh_program.py MESH …, each one of members, data, both, update
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import re
+import sys
 from typing import Any
 
 import jax
@@ -26,6 +30,9 @@ SETTINGS = {
 SACFORMER = {
     "actor_heads": 1, "actor_dropout": 0.0, "return_conditioning": "commanded",
     "target_return": "auto", "context_length": 3,
+}  # fmt: skip
+MESHES = {
+    "members": Devices(members=4), "data": Devices(data=4), "both": Devices(members=4, data=2),
 }  # fmt: skip
 COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 
@@ -131,12 +138,11 @@ def update_of_the_same_batch(agent_name: str) -> float:
 def main() -> None:
     assert jax.device_count() == 8
     one = trained(Devices())
-    found = {
-        "members": compared(one, trained(Devices(members=4))),
-        "data": compared(one, trained(Devices(data=4))),
-        "both": compared(one, trained(Devices(members=4, data=2))),
-        "update": {name: update_of_the_same_batch(name) for name in ("sacformer", "sac")},
+    found: dict[str, Any] = {
+        mesh: compared(one, trained(MESHES[mesh])) for mesh in sys.argv[1:] if mesh in MESHES
     }
+    if "update" in sys.argv[1:]:
+        found["update"] = {name: update_of_the_same_batch(name) for name in ("sacformer", "sac")}
     print(json.dumps(found))
 
 

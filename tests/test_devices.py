@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import shutil
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 from sacformer_jax import Config, load_policy, resume, train
+from sacformer_jax.cli import main
 from sacformer_jax.logging import read_records
 
 TINY = {
@@ -60,7 +63,14 @@ def _copy(run: Path, to: Path) -> Path:
 
 
 def _digest(run: Path, num_devices: int = 1) -> Any:
-    described = json.loads(_sacformer(num_devices, "describe", run, "--json"))
+    """Env steps and digest, as ``describe`` says in this process, or in one with more devices."""
+    if num_devices > 1:
+        out = _sacformer(num_devices, "describe", run, "--json")
+    else:
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert main(["describe", str(run), "--json"]) == 0
+        out = printed.getvalue()
+    described = json.loads(out)
     return described["counters"]["env_steps"], described["digest"]
 
 
@@ -182,16 +192,21 @@ def test_two_processes_continue_what_one_began(
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--coordinator", "127.0.0.1:1"], "give all three, or --distributed alone"),
-        (["--num-processes", "2", "--process-id", "0"], "give all three"),
-        (["--distributed"], "the other processes cannot be found"),
-    ],
+    "flags",
+    [["--coordinator", "127.0.0.1:1"], ["--num-processes", "2", "--process-id", "0"]],
+    ids=lambda flags: flags[0],
 )
-def test_processes_that_cannot_meet(tmp_path: Path, flags: list[str], message: str) -> None:
-    process = _start(1, "train", *_flags(tmp_path / "run", STOP), *flags)
+def test_half_a_meeting_is_refused(
+    tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", *map(str, _flags(tmp_path / "run", STOP)), *flags]) == 2
+    assert "give all three, or --distributed alone" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_processes_that_cannot_meet(tmp_path: Path) -> None:
+    process = _start(1, "train", *_flags(tmp_path / "run", STOP), "--distributed")
     _, err = process.communicate(timeout=120)
     assert process.returncode == 2
-    assert message in err
+    assert "the other processes cannot be found" in err
     assert not (tmp_path / "run").exists()

@@ -25,12 +25,11 @@ from sacformer_jax.types import Window
 HERE = Path(__file__).parent
 
 
-@pytest.fixture(scope="module")
-def found() -> Any:
+def _found(*meshes: str) -> Any:
     """What a process with 8 CPU devices finds."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
     done = subprocess.run(
-        [sys.executable, HERE / "mesh_program.py"],
+        [sys.executable, HERE / "mesh_program.py", *meshes],
         env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": str(HERE)},
         capture_output=True,
         text=True,
@@ -40,14 +39,28 @@ def found() -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize(
-    ("mesh", "num_devices"), [("members", 4), ("data", 4), ("both", 8)], ids=str
-)
+@pytest.fixture(scope="module")
+def found() -> Any:
+    return _found("members", "both", "update")
+
+
+def _check_prefill(found: Any) -> None:
+    assert set(found["prefilled"]) <= {".learner.normalizer.mean", ".learner.normalizer.m2"}
+    # Statistics of the observations are summed in another order where the data are split.
+    assert max(found["prefilled"].values(), default=0.0) < 1e-3
+
+
+def _check_collectives(found: Any) -> None:
+    """Critics, actor, and the weights of the steps; the rest is of collecting, once for it all."""
+    names = found["collectives"]
+    assert set(names) == {"all-reduce"}
+    assert 3 < names["all-reduce"] <= 3 + 7  # 5 counts of episodes, mean and m2 of observations
+
+
+@pytest.mark.parametrize(("mesh", "num_devices"), [("members", 4), ("both", 8)], ids=str)
 def test_prefill_is_the_same_to_the_bit(found: Any, mesh: str, num_devices: int) -> None:
     assert found[mesh]["num_devices"] == num_devices
-    assert set(found[mesh]["prefilled"]) <= {".learner.normalizer.mean", ".learner.normalizer.m2"}
-    # Statistics of the observations are summed in another order where the data are split.
-    assert max(found[mesh]["prefilled"].values(), default=0.0) < 1e-3
+    _check_prefill(found[mesh])
     if mesh == "members":
         assert found[mesh]["prefilled"] == {}
 
@@ -61,12 +74,16 @@ def test_members_need_no_communication(found: Any) -> None:
     assert found["members"]["collectives"] == {}
 
 
-@pytest.mark.parametrize("mesh", ["data", "both"])
-def test_one_reduction_for_each_network(found: Any, mesh: str) -> None:
-    """Critics, actor, and the weights of the steps; the rest is of collecting, once for it all."""
-    names = found[mesh]["collectives"]
-    assert set(names) == {"all-reduce"}
-    assert 3 < names["all-reduce"] <= 3 + 7  # 5 counts of episodes, mean and m2 of observations
+def test_one_reduction_for_each_network(found: Any) -> None:
+    _check_collectives(found["both"])
+
+
+@pytest.mark.slow
+def test_the_same_where_only_the_data_are_split() -> None:
+    found = _found("data")["data"]
+    assert found["num_devices"] == 4
+    _check_prefill(found)
+    _check_collectives(found)
 
 
 @pytest.mark.parametrize("agent", ["sacformer", "sac"])
