@@ -32,11 +32,15 @@ def adam_where(
     params: Params,
     grads: Params,
     opt_state: optax.OptState,
-    learning_rate: jax.Array,
+    learning_rate: Params | jax.Array,
 ) -> tuple[Params, optax.OptState]:
-    """One Adam step if ``sound``; otherwise parameters and moments stay as they are."""
+    """One Adam step if ``sound``; otherwise parameters and moments stay as they are.
+
+    The learning rate is one for all, or a tree like that of the parameters, or of its upper part.
+    """
     direction, stepped = optimizer.update(grads, opt_state)
+    rates = jax.tree.broadcast(learning_rate, params)
     params = jax.tree.map(
-        lambda p, d: jnp.where(sound, p - learning_rate * d, p), params, direction
+        lambda p, d, rate: jnp.where(sound, p - rate * d, p), params, direction, rates
     )
     return params, jax.tree.map(lambda new, old: jnp.where(sound, new, old), stepped, opt_state)

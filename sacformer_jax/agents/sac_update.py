@@ -298,8 +298,24 @@ def _update_actor(
     (grads,) = half.pull_back((gaussian_grads, predicted.grads))
     entropy = -jnp.sum(weights.actor * log_prob)
     value, entropy, own, grads = parts.data.sum((value, entropy, predicted.metrics, grads))
-    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
+    rates = _actor_rates(parts, hyper, learner.actor_params)
+    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite, rates)
     return learner, {**metrics, **own, "entropy": entropy}, fault
+
+
+def _actor_rates(
+    parts: SACParts, hyper: Hyperparameters, params: Params
+) -> dict[str, dict[str, jax.Array]] | jax.Array:
+    """Step sizes: the critics' for what learns from its prediction alone, a regression as theirs."""
+    if not getattr(parts.actor, "given", False):
+        return hyper.actor_learning_rate
+    acts = ("heads", "state_path")
+    return {
+        "params": {
+            name: hyper.actor_learning_rate if name in acts else hyper.critic_learning_rate
+            for name in params["params"]
+        }
+    }
 
 
 @dataclasses.dataclass(frozen=True)
