@@ -1,10 +1,14 @@
-"""Is SACFormer better than SAC? Both with preset `best`, five tasks, seeds nothing was tuned on.
+"""Is SACFormer better than SAC? On seeds that nothing was tuned on.
 
-python experiments/arena.py --jobs 2
+python experiments/arena.py --jobs 2                   # five tasks, preset `best` of both
+python experiments/arena.py --arena hidden --jobs 2    # velocities hidden, preset `memory` of both
+python experiments/arena.py --arena delay --jobs 2     # actions two steps late, preset `memory`
 
-100,000 env steps, seeds 100 to 104 in one program, each run on a core of its own. Beside them both
-agents with preset `cpu` (SAC as published: single steps, one-step targets), and presets `paper` and
-`authors` at the sizes that make `cpu` fast, as variants.py has them, with the first three seeds.
+100,000 env steps, seeds 100 to 104 in one program, each run on a core of its own. Beside preset
+`best` both agents with preset `cpu` (SAC as published: single steps, one-step targets), and presets
+`paper` and `authors` at the sizes that make `cpu` fast, as variants.py has them, with the first
+three seeds. With preset `memory` SAC sees the last 6 observations with the actions between them,
+SACFormer the same as tokens, and neither of them a return-to-go.
 """
 
 from __future__ import annotations
@@ -13,13 +17,15 @@ import itertools
 import sys
 from typing import Any
 
-from study import Study
+import memory
+from study import Study, main_of_choices
 from variants import LIKE_CPU
 
 from sacformer_jax import Config
 
-TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
+FULL = "full"
 ENV_STEPS, FIRST_SEED = 100_000, 100
+TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
 VARIANTS: dict[str, dict[str, Any]] = {
     "sacformer": {"preset": "best", "agent": "sacformer", "seeds": 5},
     "sac": {"preset": "best", "agent": "sac", "seeds": 5},
@@ -28,18 +34,25 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {"preset": "paper", "agent": "sacformer", "seeds": 3, **LIKE_CPU},
     "authors": {"preset": "authors", "agent": "sacformer", "seeds": 3, **LIKE_CPU},
 }
+MEMORY_VARIANTS: dict[str, dict[str, Any]] = {
+    agent: {"preset": "memory", "agent": agent, "seeds": 5} for agent in ("sacformer", "sac")
+}
 
 
-def study() -> Study:
+def study(arena: str) -> Study:
     """All its runs."""
+    full = arena == FULL
+    tasks, variants = (TASKS, VARIANTS) if full else (memory.TASKS, MEMORY_VARIANTS)
+    kept_from_the_agent = {} if full else memory.ARENAS[arena]
     configs = {
         f"{task}-{variant}": Config.from_preset(
-            **settings, env=task, total_env_steps=ENV_STEPS, seed=FIRST_SEED
+            **settings, env=task, total_env_steps=ENV_STEPS, seed=FIRST_SEED, **kept_from_the_agent
         )
-        for (variant, settings), task in itertools.product(VARIANTS.items(), TASKS)
+        for (variant, settings), task in itertools.product(variants.items(), tasks)
     }
-    return Study("arena", configs, __file__)
+    return Study("arena" if full else f"arena-{arena}", configs, __file__)
 
 
 if __name__ == "__main__":
-    sys.exit(study().main())
+    arenas = (FULL, *memory.ARENAS)
+    sys.exit(main_of_choices(study, "arena", arenas, "what is kept from the agents"))

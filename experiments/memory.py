@@ -59,7 +59,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "lambda-predicting": {**_LAMBDA_SEQUENCE, **_PREDICTED},
     "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **_PREDICTED, "state_path_width": 256},
     "belief": {**_LAMBDA_SEQUENCE, **_BELIEF},
-    "belief-critic-rate": {**_LAMBDA_SEQUENCE, **_BELIEF},
     "with-return": {"tokens": "gsa", **_PREDICTED},
 }
 

@@ -16,7 +16,7 @@ from sacformer_jax.values import ConfigError, coerced, unknown
 AgentName = Literal["sacformer", "sac", "td3", "ddpg", "ppo"]
 MLP_AGENTS = ("sac", "td3", "ddpg", "ppo")
 """Agents that see one state."""
-PresetName = Literal["cpu", "best", "paper", "authors"]
+PresetName = Literal["cpu", "best", "memory", "paper", "authors"]
 Conditioning = Literal["hindsight", "commanded", "none"]
 EngineName = Literal["auto", "native", "mjx"]
 MjxPreset = Literal["parity", "fast"]

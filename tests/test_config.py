@@ -196,6 +196,21 @@ def test_preset_best_changes_only_what_was_tuned() -> None:
         assert {name: best[name] for name in best if best[name] != cpu[name]} == expected
 
 
+def test_preset_memory_shows_both_agents_the_same_past() -> None:
+    sacformer, sac = (
+        Config.from_preset("memory", agent=agent, env="Hopper", hide_velocities=True)
+        for agent in ("sacformer", "sac")
+    )
+    context = sacformer.context
+    seen = (context.context_length, context.acting_context_limit, context.burn_in + 1)
+    assert seen == (sac.task.stack_obs,) * 3
+    assert (context.tokens, context.return_conditioning) == ("gsa", "none")
+    for made in (sacformer, sac):
+        best = Config.from_preset("best", agent=made.agent, env="Hopper").flat()
+        for name in ("td_lambda", "total_env_steps", "batch_size", "state_path_width"):
+            assert made.flat()[name] == best[name], name
+
+
 @pytest.mark.parametrize("agent", ["td3", "ddpg"])
 def test_preset_paper_runs_the_deterministic_agents_as_cleanrl(agent: str) -> None:
     flat = Config.from_preset("paper", agent=agent, env="Hopper").flat()

@@ -311,8 +311,8 @@ def test_critics_may_see_what_the_transformer_makes_of_the_past():
     assert float(metrics["critic_loss"]) == pytest.approx(float(expected), rel=1e-4)
 
 
-def first_gradients(window, key, spec, **fields):
-    """The actor's parameters, the gradients of its loss, and the prediction's loss."""
+def first_update(window, key, spec, **fields):
+    """The actor's parameters, how they move, the gradients of its loss, the prediction's loss."""
     config = point_config(context_length=K, **fields)
     agent = agents.make(config, spec)
     learner = jax.jit(agent.init)(jax.random.key(0))
@@ -323,13 +323,14 @@ def first_gradients(window, key, spec, **fields):
     new, metrics = jax.jit(agent.update)(learner, hyperparameters(config, 1), window, key)
     # The first moment of Adam's first step is a tenth of the gradient.
     grads = jax.tree.map(lambda x: 10.0 * x, new.actor_opt.mu["params"])
-    return learner.actor_params, grads, float(metrics["prediction_loss"])
+    moved = jax.tree.map(jnp.subtract, new.actor_params, learner.actor_params)["params"]
+    return learner.actor_params, moved, grads, float(metrics["prediction_loss"])
 
 
 def test_the_actor_learns_to_predict_as_far_as_that_weighs():
     window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
-    params, once, loss_once = first_gradients(window, key, spec, prediction_weight=1.0)
-    _, thrice, loss_thrice = first_gradients(window, key, spec, prediction_weight=3.0)
+    params, _, once, loss_once = first_update(window, key, spec, prediction_weight=1.0)
+    _, _, thrice, loss_thrice = first_update(window, key, spec, prediction_weight=3.0)
     assert loss_once == loss_thrice
 
     actor = transformer(point_config(context_length=K), spec, predicts=True)
@@ -363,11 +364,18 @@ def test_the_actor_learns_to_predict_as_far_as_that_weighs():
 def test_a_transformer_may_learn_from_its_prediction_alone():
     """Three times its weight: three times the transformer's gradient, and the same of the rest."""
     window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
-    fields = {"transformer_loss": "prediction", "state_path_width": 8}
-    params, once, _ = first_gradients(window, key, spec, **fields, prediction_weight=1.0)
-    _, thrice, _ = first_gradients(window, key, spec, **fields, prediction_weight=3.0)
+    fields = {
+        "transformer_loss": "prediction", "state_path_width": 8, "actor_learning_rate": 1e-3,
+        "critic_learning_rate": 2e-3,
+    }  # fmt: skip
+    params, moved, once, _ = first_update(window, key, spec, **fields, prediction_weight=1.0)
+    _, _, thrice, _ = first_update(window, key, spec, **fields, prediction_weight=3.0)
     for name, gradient in once.items():
-        times = 1.0 if name in ("heads", "state_path") else 3.0
+        acts = name in ("heads", "state_path")
+        times = 1.0 if acts else 3.0
+        # Adam's first step is one step size; the transformer's is that of the critics.
+        step = max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(moved[name]))
+        assert step == pytest.approx(1e-3 if acts else 2e-3, rel=1e-2), name
         jax.tree.map(
             lambda a, b, times=times: np.testing.assert_allclose(times * a, b, 1e-4, 1e-6),
             gradient,

@@ -208,10 +208,23 @@ def test_the_agents_are_compared_on_the_same_task(name: str, arguments: tuple[st
     assert {config.agent for config in study.configs.values()} == {"sacformer", "sac"}
 
 
-def test_the_arena_is_fair_and_its_seeds_are_fresh() -> None:
-    configs = importlib.import_module("arena").study().configs
+@pytest.mark.parametrize(
+    ("arena", "preset", "kept"),
+    [
+        ("full", "best", (False, 0)),
+        ("hidden", "memory", (True, 0)),
+        ("delay", "memory", (False, 2)),
+    ],
+)
+def test_the_arena_is_fair_and_its_seeds_are_fresh(
+    arena: str, preset: str, kept: tuple[bool, int]
+) -> None:
+    study = importlib.import_module("arena").study(arena)
+    configs = study.configs
+    assert study.name == ("arena" if arena == "full" else f"arena-{arena}")
     same = (
         "total_env_steps", "updates_per_env_step", "num_envs", "eval_every", "eval_episodes",
+        "hide_velocities", "action_delay",
     )  # fmt: skip
     for field in same:
         assert len({config.flat()[field] for config in configs.values()}) == 1, field
@@ -221,12 +234,25 @@ def test_the_arena_is_fair_and_its_seeds_are_fresh() -> None:
         for config in importlib.import_module(arguments[0]).study(*arguments[1:]).configs.values()
         for seed in config.all_seeds
     }
-    for task in ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid"):
+    tasks = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")[: 5 if arena == "full" else 3]
+    for task in tasks:
         own, opponent = configs[f"{task}-sacformer"], configs[f"{task}-sac"]
-        assert (own.preset, opponent.preset) == ("best", "best")
+        for config in (own, opponent):
+            config.validated()
+            assert config.preset == preset
+            assert (config.task.hide_velocities, config.task.action_delay) == kept
         assert own.all_seeds == opponent.all_seeds
         assert len(own.all_seeds) >= 5
         assert not tuned & set(own.all_seeds)
+
+
+def test_preset_memory_is_what_was_tuned() -> None:
+    tuned = importlib.import_module("memory").study("hidden").configs
+    for agent, variant in {"sacformer": "belief", "sac": "sac-lambda"}.items():
+        preset = Config.from_preset("memory", env="Hopper", agent=agent, hide_velocities=True)
+        other = tuned[f"Hopper-{variant}"].flat()
+        differs = {name for name, value in preset.flat().items() if other[name] != value}
+        assert differs == {"preset", "total_env_steps", "seeds", "run_dir"}
 
 
 def test_the_studies_are_those_of_the_paper() -> None:

@@ -20,7 +20,7 @@ from report.scores import (
     run_scores,
 )
 
-TIMED = {"arena"}
+TIMED = {"arena", "arena-hidden", "arena-delay"}
 """Studies whose runs had a core each."""
 
 

@@ -226,7 +226,9 @@ def _update_policy(
         return -jnp.sum(weights.actor * q)
 
     value, grads = parts.data.sum(jax.value_and_grad(loss)(learner.actor_params))
-    learner, metrics, fault = step_actor(learner, hyper, value, grads, non_finite)
+    learner, metrics, fault = step_actor(
+        learner, value, grads, non_finite, hyper.actor_learning_rate
+    )
 
     def follow(sound: jax.Array, target: Params, online: Params) -> Params:
         return soft_update(target, online, jnp.where(sound, hyper.tau, 0.0))

@@ -141,30 +141,27 @@ def step_critics(
 
 def step_actor(
     learner: LearnerState,
-    hyper: Hyperparameters,
     loss: jax.Array,
     grads: Params,
     non_finite: list[jax.Array],
-    learning_rate: Params | jax.Array | None = None,
+    learning_rate: Params | jax.Array,
 ) -> tuple[LearnerState, Metrics, jax.Array]:
     """One Adam step of the actor, where everything is finite.
 
     Args:
       learner: its actor is stepped.
-      hyper: numeric settings.
-      learning_rate: as :func:`adam_where` takes it, in place of the actor's.
       loss: the actor's, over all devices.
       grads: of it.
       non_finite: as :func:`step_critics` returns it.
+      learning_rate: as :func:`~sacformer_jax.agents.faults.adam_where` takes it.
 
     Returns:
       the learner, metrics, and the update's ``fault``.
     """
     grad_norm = optax.global_norm(grads)
     fault = first_fault([*non_finite, num_non_finite(loss), num_non_finite(grad_norm)])
-    rate = hyper.actor_learning_rate if learning_rate is None else learning_rate
     params, opt = adam_where(
-        fault < 0, ADAM, learner.actor_params, grads, learner.actor_opt, rate
+        fault < 0, ADAM, learner.actor_params, grads, learner.actor_opt, learning_rate
     )
     learner = dataclasses.replace(learner, actor_params=params, actor_opt=opt)
     return learner, {"actor_loss": loss, "actor_grad_norm": grad_norm}, fault

@@ -53,6 +53,7 @@ class SACParts(OffPolicyParts):
       initial_alpha: α at the start.
       td_lambda: λ of the critics' targets along a window.
       prediction_weight: of the loss in predicting the next step, in the actor's; 0: none.
+      predicts_alone: the actor's transformer learns from nothing else.
     """
 
     acting_actor: nn.Module
@@ -64,6 +65,7 @@ class SACParts(OffPolicyParts):
     initial_alpha: float
     td_lambda: float
     prediction_weight: float
+    predicts_alone: bool
 
 
 def sac_parts(
@@ -95,6 +97,7 @@ def sac_parts(
         initial_alpha=config.learning.alpha,
         td_lambda=config.learning.td_lambda,
         prediction_weight=config.learning.prediction_weight,
+        predicts_alone=config.actor.transformer_loss == "prediction",
         num_critic_features=config.actor.actor_width if config.critic.critic_features else 0,
         normalize_obs=config.context.normalize_obs,
         data=data,

@@ -35,6 +35,8 @@ from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
 _LEAST_VARIANCE = 1e-4
 """Taken for the variance of what hardly ever changes, that its noise is not learnt."""
+_ACTS = ("heads", "state_path")
+"""Layers of an actor that learn from the actor's loss, whatever its transformer learns from."""
 
 
 def bellman_target(
@@ -194,7 +196,7 @@ def _pretrain(
     shown = parts.distribution.mode(half.gaussian.mean)
     error = jnp.sum(weights.actor * jnp.mean(jnp.abs(shown - window.action), axis=-1))
     value, error, own, grads = parts.data.sum((value, error, predicted.metrics, grads))
-    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite)
+    learner, metrics, fault = _step_actor(parts, hyper, half, value, grads)
     return learner, {**half.metrics, **metrics, **own, "action_error": error, "fault": fault}
 
 
@@ -298,24 +300,25 @@ def _update_actor(
     (grads,) = half.pull_back((gaussian_grads, predicted.grads))
     entropy = -jnp.sum(weights.actor * log_prob)
     value, entropy, own, grads = parts.data.sum((value, entropy, predicted.metrics, grads))
-    rates = _actor_rates(parts, hyper, learner.actor_params)
-    learner, metrics, fault = step_actor(learner, hyper, value, grads, half.non_finite, rates)
+    learner, metrics, fault = _step_actor(parts, hyper, half, value, grads)
     return learner, {**metrics, **own, "entropy": entropy}, fault
 
 
-def _actor_rates(
-    parts: SACParts, hyper: Hyperparameters, params: Params
-) -> dict[str, dict[str, jax.Array]] | jax.Array:
-    """Step sizes: the critics' for what learns from its prediction alone, a regression as theirs."""
-    if not getattr(parts.actor, "given", False):
-        return hyper.actor_learning_rate
-    acts = ("heads", "state_path")
-    return {
-        "params": {
-            name: hyper.actor_learning_rate if name in acts else hyper.critic_learning_rate
-            for name in params["params"]
+def _step_actor(
+    parts: SACParts, hyper: Hyperparameters, half: _Half, loss: jax.Array, grads: Params
+) -> tuple[LearnerState, Metrics, jax.Array]:
+    """:func:`step_actor`; what learns from its prediction alone takes the critics' step size, as
+    it is a regression like theirs.
+    """
+    rate: Any = hyper.actor_learning_rate
+    if parts.predicts_alone:
+        rate = {
+            "params": {
+                name: hyper.actor_learning_rate if name in _ACTS else hyper.critic_learning_rate
+                for name in grads["params"]
+            }
         }
-    }
+    return step_actor(half.learner, loss, grads, half.non_finite, rate)
 
 
 @dataclasses.dataclass(frozen=True)
