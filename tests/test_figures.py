@@ -326,10 +326,11 @@ def test_files_are_the_same_every_time_and_made_without_jax(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("seeds", [1, 3])
-def test_captions_and_legends_lie_within_the_page(tmp_path: Path, seeds: int) -> None:
+@pytest.mark.parametrize("variant", ["", "-of-which-much-is-to-be-said", "-very-long" * 7])
+def test_captions_and_legends_lie_within_the_page(tmp_path: Path, seeds: int, variant: str) -> None:
     tasks = ("HalfCheetah", "Hopper", "Walker2d", "Ant")
-    runs = {f"{task}-{agent}": [[1, 2]] * seeds for agent in AGENTS for task in tasks}
-    del runs["Ant-ddpg"]
+    runs = {f"{task}-{agent}{variant}": [[1, 2]] * seeds for agent in AGENTS for task in tasks}
+    del runs[f"Ant-ddpg{variant}"]
     study = read(tmp_path / "figure2-full.csv", runs)
     with figures.matplotlib.rc_context(figures.FONTS):
         figure = panels_figure(study)
