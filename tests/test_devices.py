@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import shutil
@@ -15,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from describing import described
 
 from sacformer_jax import Config, load_policy, resume, train
 from sacformer_jax.cli import main
@@ -65,13 +64,10 @@ def _copy(run: Path, to: Path) -> Path:
 def _digest(run: Path, num_devices: int = 1) -> Any:
     """Env steps and digest, as ``describe`` says in this process, or in one with more devices."""
     if num_devices > 1:
-        out = _sacformer(num_devices, "describe", run, "--json")
+        said = json.loads(_sacformer(num_devices, "describe", run, "--json"))
     else:
-        with contextlib.redirect_stdout(io.StringIO()) as printed:
-            assert main(["describe", str(run), "--json"]) == 0
-        out = printed.getvalue()
-    described = json.loads(out)
-    return described["counters"]["env_steps"], described["digest"]
+        said = described(run)
+    return said["counters"]["env_steps"], said["digest"]
 
 
 def _losses(run: Path) -> np.ndarray:
