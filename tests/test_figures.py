@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import math
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from report.lines import StudyLines, read_study
 from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS, normalized
 from report.styles import AGENTS, Style, styles_of
 from report.tables import aggregates, markdown
-from report.timed import scores_within, timed
+from report.timed import scores_until, step_seconds, timed
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 COLUMNS = (
@@ -213,9 +214,10 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
     (one,) = timed(study, "sac")  # PPO has another number of seeds
     assert (one.variant, one.tasks) == ("sacformer", ["Hopper", "Walker2d"])
     assert one.slowdown == pytest.approx(4.0)
-    # After SAC's 7 seconds: evaluations at 0, 2, 4 and 6 s on Hopper, on Walker2d the first alone.
-    within = scores_within(study.lines["Hopper", "sacformer"], 7.0)
-    assert normalized("Hopper", within) == pytest.approx([0.25, 0.35])
+    # In SAC's 7 seconds: evaluations at 0, 2, 4 and 6 s on Hopper, on Walker2d the first alone.
+    hopper = study.lines["Hopper", "sacformer"]
+    assert normalized("Hopper", scores_until(hopper, 4_500.0)) == pytest.approx([0.25, 0.35])
+    assert normalized("Hopper", scores_until(hopper, 0.0)) == pytest.approx([0.0, 0.0])
     assert one.improvement.value == pytest.approx((0.5 + 0.0) / 2)
     # Trimmed are one at each end: of 0.1, 0.1, 0.25, 0.35, and of 0.21, 0.21, 0.3, 0.3.
     assert one.difference.value == pytest.approx((0.1 + 0.25) / 2 - (0.21 + 0.3) / 2)
@@ -225,6 +227,17 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
     assert "| SACFormer | 4.00 | -0.08 [" in text
     figures.draw(write(tmp_path / "figure2-cpu.csv", runs, seconds=seconds))
     assert "wall-clock" not in (tmp_path / "figure2-cpu.md").read_text()
+
+
+def test_a_run_that_was_held_up_is_no_slower(tmp_path: Path) -> None:
+    study = read(tmp_path / "arena.csv", {"Hopper-sac": [[0.0, 1, 2, 3, 4]] * 2})
+    line = study.lines["Hopper", "sac"]
+    assert step_seconds(line) == pytest.approx(0.5 / 1_000)
+    for of_seed in line.seconds.values():
+        of_seed.update({step: at + 60.0 for step, at in of_seed.items() if step > 3_000})
+    assert step_seconds(line) == pytest.approx(0.5 / 1_000)
+    line.seconds = {0: {1_000: 0.0}}
+    assert math.isnan(step_seconds(line))
 
 
 def test_the_table_of_scores(tmp_path: Path) -> None:

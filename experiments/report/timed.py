@@ -2,11 +2,14 @@
 
 Seconds are those of training, all seeds of a run together, without compilation and evaluations:
 they say something where runs had the same share of the same machine, as in the studies named here.
+An env step takes a run's median over the stretches between its evaluations, all of them the same
+work: a run that was held up for a while is no slower for it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -55,31 +58,39 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
             # All seeds of a run are one program: of other numbers of seeds, times say nothing.
             if len(own.seeds) != len(base.seeds):
                 continue
-            limit = total_seconds(base)
+            slowdown = step_seconds(own) / step_seconds(base)
             tasks.append(task)
-            slowdowns.append(total_seconds(own) / limit)
-            of.append(normalized(task, scores_within(own, limit)))
+            slowdowns.append(slowdown)
+            of.append(normalized(task, scores_until(own, _steps_for(base, slowdown))))
             over.append(normalized(task, base.scores))
         if tasks:
-            slowdown = float(np.exp(np.mean(np.log(slowdowns))))
+            mean_slowdown = float(np.exp(np.mean(np.log(slowdowns))))
             difference = iqm_difference(of, over)
             improvement = probability_of_improvement(of, over)
-            made.append(Timed(variant, slowdown, difference, improvement, tasks))
+            made.append(Timed(variant, mean_slowdown, difference, improvement, tasks))
     return made
 
 
-def total_seconds(line: Line) -> float:
-    """Of a line's longest seed, or of all of them where they are one program."""
-    return max(max(of_seed.values()) for of_seed in line.seconds.values())
+def step_seconds(line: Line) -> float:
+    """What an env step of all seeds takes a line; NaN with fewer than two evaluations."""
+    of_stretches = []
+    for of_seed in line.seconds.values():
+        steps = np.array(sorted(of_seed), float)
+        if steps.size > 1:
+            of_stretches.extend(np.diff([of_seed[int(step)] for step in steps]) / np.diff(steps))
+    return float(np.median(of_stretches)) if of_stretches else math.nan
 
 
-def scores_within(line: Line, limit: float) -> np.ndarray:
-    """Score ``[S]`` of each seed from the evaluations it had after ``limit`` seconds of training.
+def scores_until(line: Line, limit: float) -> np.ndarray:
+    """Score ``[S]`` of each seed from its evaluations in the first ``limit`` env steps.
 
     The first evaluation, before anything was learnt, is always among them.
     """
-    scores = []
-    for seed in line.seeds:
-        steps = sorted(step for step, at in line.seconds[seed].items() if at <= limit)
-        scores.append(run_scores(np.array([line.curves[seed][step] for step in steps])))
-    return np.array(scores, float)
+    within = line.steps[line.steps <= max(limit, line.steps[0])]
+    return run_scores(line.returns_at(within).T)
+
+
+def _steps_for(base: Line, slowdown: float) -> float:
+    """Env steps in the baseline's time. Those to the first evaluation are random, and free."""
+    first = float(base.steps[0])
+    return first + (base.last_step - first) / slowdown
