@@ -44,8 +44,9 @@ _LAMBDA_PATH: dict[str, Any] = {"td_lambda": 0.5, "state_path_width": 256}
 _LARGER_PATH: dict[str, Any] = {**_LAMBDA_PATH, "td_lambda": 0.8}
 _NO_TIME: dict[str, Any] = {"time_embedding": "none"}
 _STATES: dict[str, Any] = {**_NO_TIME, "return_conditioning": "none"}
-_PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
-_BELIEF: dict[str, Any] = {**_PREDICTED, "transformer_loss": "prediction"}
+PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
+# The transformer learns from predicting alone; actor and critics see what it makes of the past.
+BELIEF: dict[str, Any] = {**PREDICTED, "transformer_loss": "prediction"}
 TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
     "lambda-path": _LAMBDA_PATH,
@@ -57,10 +58,9 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-as-sac": {**_LAMBDA_PATH, **_STATES, "head_init_scale": 1.0, "batch_size": 42},
     "larger-path": _LARGER_PATH,
     "larger-path-no-time": {**_LARGER_PATH, **_NO_TIME},
-    "lambda-path-predicting": {**_LAMBDA_PATH, **_PREDICTED},
-    # The transformer learns from predicting alone; actor and critics see what it makes of the past.
-    "lambda-belief": {**_LAMBDA_PATH, **_BELIEF},
-    "lambda-belief-states": {**_LAMBDA_PATH, **_BELIEF, **_STATES},
+    "lambda-path-predicting": {**_LAMBDA_PATH, **PREDICTED},
+    "lambda-belief": {**_LAMBDA_PATH, **BELIEF},
+    "lambda-belief-states": {**_LAMBDA_PATH, **BELIEF, **_STATES},
 }  # fmt: skip
 # 42 windows of 6 for 256 single steps.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}

@@ -16,6 +16,7 @@ import itertools
 import sys
 from typing import Any
 
+from improve import BELIEF, PREDICTED
 from study import Study, main_of_choices
 
 from sacformer_jax import Config
@@ -41,10 +42,6 @@ _LAMBDA_SEQUENCE: dict[str, Any] = {
 _LAMBDA_SAC: dict[str, Any] = {
     "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
 }  # fmt: skip
-_PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
-_BELIEF: dict[str, Any] = {
-    **_PREDICTED, "transformer_loss": "prediction", "state_path_width": 256,
-}  # fmt: skip
 VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"agent": "sac", "stack_obs": K},
     "sac-lambda": {**_LAMBDA_SAC, "stack_obs": K},
@@ -53,13 +50,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     # Critics that see no more than the current state.
     "blind-critic": _SEQUENCE,
     "critic-features": {**_SEQUENCE, "critic_features": True},
-    "predicting-features": {**_SEQUENCE, **_PREDICTED},
+    "predicting-features": {**_SEQUENCE, **PREDICTED},
     "critic-history": {**_SEQUENCE, **_WHOLE_PAST, "critic_history": K},
     "lambda-history": {**_LAMBDA_SEQUENCE, "critic_history": K},
-    "lambda-predicting": {**_LAMBDA_SEQUENCE, **_PREDICTED},
-    "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **_PREDICTED, "state_path_width": 256},
-    "belief": {**_LAMBDA_SEQUENCE, **_BELIEF},
-    "with-return": {"tokens": "gsa", **_PREDICTED},
+    "lambda-predicting": {**_LAMBDA_SEQUENCE, **PREDICTED},
+    "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **PREDICTED, "state_path_width": 256},
+    "belief": {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256},
+    "with-return": {"tokens": "gsa", **PREDICTED},
 }
 
 
