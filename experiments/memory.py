@@ -56,8 +56,16 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "lambda-predicting": {**_LAMBDA_SEQUENCE, **PREDICTED},
     "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **PREDICTED, "state_path_width": 256},
     "belief": {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256},
+    # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
+    "belief-one-step-targets": {
+        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "td_lambda": 0.0,
+    },
+    "belief-stacked": {
+        **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
+        "batch_size": 256, "stack_obs": K, "state_path_width": 256,
+    },
     "with-return": {"tokens": "gsa", **PREDICTED},
-}
+}  # fmt: skip
 
 
 def study(arena: str) -> Study:
