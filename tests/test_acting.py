@@ -116,7 +116,8 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
 @pytest.mark.parametrize(
     ("tokens", "limit", "fields"),
     [
-        ("gs", 1000, {}),
+        ("gs", 100, {}),
+        pytest.param("gs", 1000, {}, marks=pytest.mark.slow),
         pytest.param("gsa", 1000, {}, marks=pytest.mark.slow),
         ("gsa", 100, {"time_embedding": "rotary", "state_path_width": 8}),
         pytest.param(

@@ -109,6 +109,7 @@ def test_seeds_are_trained_in_one_program():
     assert results["scaling.seeds.2.temp_bytes"] > 0
 
 
+@pytest.mark.slow
 def test_checkpoints_are_timed_beside_training(tmp_path):
     """The frame alone: how long a tiny one takes says nothing."""
     results = checkpointing.measure_in(tmp_path / "run", Config.from_preset("cpu", **TINY), turns=2)

@@ -91,6 +91,7 @@ def test_learns_and_a_broken_update_does_not() -> None:
     check_learning("ddpg")
 
 
+@pytest.mark.slow
 def test_a_run_from_the_command_line(tmp_path: Path) -> None:
     flags = [
         f"--no-{name.replace('_', '-')}"

@@ -429,6 +429,7 @@ def check_picture(path: Path) -> None:
     assert 0.01 < (grey < 200).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_the_script(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     to, picture = tmp_path / "numbers.json", tmp_path / "picture.png"
     assert diagnose.main([str(run), *FEW, "--json", str(to), "--picture", str(picture)]) == 0

@@ -70,6 +70,7 @@ def test_one_seed_becomes_a_run_like_any_other(seeds: Path, tmp_path: Path) -> N
     assert read_records(path / "metrics.jsonl", "eval")[-1]["env_steps"] == 600
 
 
+@pytest.mark.slow
 def test_some_seeds_in_another_order(seeds: Path, tmp_path: Path) -> None:
     path = extract(seeds, ["seed-2", 5], tmp_path / "two")
     after, before = _states(path), _states(seeds)

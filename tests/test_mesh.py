@@ -41,7 +41,7 @@ def _found(*meshes: str) -> Any:
 
 @pytest.fixture(scope="module")
 def found() -> Any:
-    return _found("members", "both", "update")
+    return _found("members", "update")
 
 
 def _check_prefill(found: Any) -> None:
@@ -57,33 +57,26 @@ def _check_collectives(found: Any) -> None:
     assert 3 < names["all-reduce"] <= 3 + 7  # 5 counts of episodes, mean and m2 of observations
 
 
-@pytest.mark.parametrize(("mesh", "num_devices"), [("members", 4), ("both", 8)], ids=str)
-def test_prefill_is_the_same_to_the_bit(found: Any, mesh: str, num_devices: int) -> None:
-    assert found[mesh]["num_devices"] == num_devices
-    _check_prefill(found[mesh])
-    if mesh == "members":
-        assert found[mesh]["prefilled"] == {}
-
-
 def test_members_on_devices_of_their_own_learn_the_same(found: Any) -> None:
-    assert found["members"]["learner"] < 1e-5
-    assert found["members"]["evaluation"] < 1e-2
+    members = found["members"]
+    assert members["num_devices"] == 4
+    assert members["prefilled"] == {}  # to the bit
+    assert members["learner"] < 1e-5
+    assert members["evaluation"] < 1e-2
 
 
 def test_members_need_no_communication(found: Any) -> None:
     assert found["members"]["collectives"] == {}
 
 
-def test_one_reduction_for_each_network(found: Any) -> None:
-    _check_collectives(found["both"])
-
-
 @pytest.mark.slow
-def test_the_same_where_only_the_data_are_split() -> None:
-    found = _found("data")["data"]
-    assert found["num_devices"] == 4
-    _check_prefill(found)
-    _check_collectives(found)
+def test_data_on_devices_of_their_own() -> None:
+    """The same to the bit through prefill, and one reduction for each network."""
+    found = _found("data", "both")
+    for mesh, num_devices in (("data", 4), ("both", 8)):
+        assert found[mesh]["num_devices"] == num_devices
+        _check_prefill(found[mesh])
+        _check_collectives(found[mesh])
 
 
 @pytest.mark.parametrize("agent", ["sacformer", "sac"])

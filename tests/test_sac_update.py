@@ -327,13 +327,8 @@ def first_update(window, key, spec, **fields):
     return learner.actor_params, moved, grads, float(metrics["prediction_loss"])
 
 
-def test_the_actor_learns_to_predict_as_far_as_that_weighs():
-    window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
-    params, _, once, loss_once = first_update(window, key, spec, prediction_weight=1.0)
-    _, _, thrice, loss_thrice = first_update(window, key, spec, prediction_weight=3.0)
-    assert loss_once == loss_thrice
-
-    actor = transformer(point_config(context_length=K), spec, predicts=True)
+def prediction_loss(actor, params, window):
+    """And its gradient in the actor's parameters, by NumPy and ``jax.grad``."""
     known = np.asarray(window.bootstrap_mask & window.state_mask[:, 1:])
     # A mean over the critics' steps: of a step that terminated there is no next observation.
     weights = np.asarray(window.weight)[:, None] * known
@@ -349,44 +344,55 @@ def test_the_actor_learns_to_predict_as_far_as_that_weighs():
         return (weights / judged * share).sum()
 
     value, grads = jax.jit(jax.value_and_grad(loss))(params)
-    assert loss_once == pytest.approx(float(value), rel=1e-5)
+    return float(value), grads["params"]
+
+
+def test_the_actor_learns_to_predict_as_far_as_that_weighs():
+    window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
+    params, _, once, loss_once = first_update(window, key, spec, prediction_weight=1.0)
+    _, _, thrice, loss_thrice = first_update(window, key, spec, prediction_weight=3.0)
+    assert loss_once == loss_thrice
+
+    actor = transformer(point_config(context_length=K), spec, predicts=True)
+    value, grads = prediction_loss(actor, params, window)
+    assert loss_once == pytest.approx(value, rel=1e-5)
     # What is learnt besides is the same for both weights.
     for name in ("prediction", "prediction_out", "embed_state", "trunk", "heads"):
         got = jax.tree.map(lambda a, b: (b - a) / 2.0, once[name], thrice[name])
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5),
             got,
-            grads["params"][name],
+            grads[name],
         )
-    assert np.any(grads["params"]["embed_state"]["kernel"])
+    assert np.any(grads["embed_state"]["kernel"])
 
 
 def test_a_transformer_may_learn_from_its_prediction_alone():
-    """Three times its weight: three times the transformer's gradient, and the same of the rest."""
     window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
     fields = {
         "transformer_loss": "prediction", "state_path_width": 8, "actor_learning_rate": 1e-3,
         "critic_learning_rate": 2e-3,
     }  # fmt: skip
-    params, moved, once, _ = first_update(window, key, spec, **fields, prediction_weight=1.0)
-    _, _, thrice, _ = first_update(window, key, spec, **fields, prediction_weight=3.0)
-    for name, gradient in once.items():
-        acts = name in ("heads", "state_path")
-        times = 1.0 if acts else 3.0
-        # Adam's first step is one step size; the transformer's is that of the critics.
-        step = max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(moved[name]))
-        assert step == pytest.approx(1e-3 if acts else 2e-3, rel=1e-2), name
-        jax.tree.map(
-            lambda a, b, times=times: np.testing.assert_allclose(times * a, b, 1e-4, 1e-6),
-            gradient,
-            thrice[name],
-        )
-        assert any(np.any(x) for x in jax.tree.leaves(gradient)), name
-
-    # The actor sees the features beside the state, though: it acts on the past.
+    params, moved, got, loss = first_update(window, key, spec, **fields, prediction_weight=3.0)
     actor = transformer(
         point_config(context_length=K), spec, predicts=True, given=True, state_path=(8, 8)
     )
+    value, wanted = prediction_loss(actor, params, window)
+    assert loss == pytest.approx(value, rel=1e-5)
+    for name, gradient in got.items():
+        acts = name in ("heads", "state_path")
+        # Adam's first step is one step size; the transformer's is that of the critics.
+        step = max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(moved[name]))
+        assert step == pytest.approx(1e-3 if acts else 2e-3, rel=1e-2), name
+        assert any(np.any(x) for x in jax.tree.leaves(gradient)), name
+        if not acts:
+            jax.tree.map(
+                lambda a, b: np.testing.assert_allclose(a, 3.0 * b, 1e-3, 1e-5),
+                gradient,
+                wanted[name],
+            )
+
+    # The actor sees the features beside the state, though: it acts on the past.
     shown = output_of(actor, params, window).gaussian.mean
     before = dataclasses.replace(window, obs=window.obs.at[:, 0].add(1.0))
     other = output_of(actor, params, before).gaussian.mean

@@ -73,7 +73,7 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
 
 def step_seconds(line: Line) -> float:
     """What an env step of all seeds takes a line; NaN with fewer than two evaluations."""
-    of_stretches = []
+    of_stretches: list[float] = []
     for of_seed in line.seconds.values():
         steps = np.array(sorted(of_seed), float)
         if steps.size > 1:
