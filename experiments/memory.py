@@ -64,6 +64,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
         **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
         "batch_size": 256, "stack_obs": K, "state_path_width": 256,
     },
+    "belief-stacked-lambda": {
+        **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
+        "learnt_steps": K, "td_lambda": 0.5, "stack_obs": K, "state_path_width": 256,
+    },
     "with-return": {"tokens": "gsa", **PREDICTED},
 }  # fmt: skip
 
