@@ -8,7 +8,9 @@ python experiments/arena.py --arena delay --jobs 2     # actions two steps late,
 `best` both agents with preset `cpu` (SAC as published: single steps, one-step targets), and presets
 `paper` and `authors` at the sizes that make `cpu` fast, as variants.py has them, with the first
 three seeds. With preset `memory` SAC sees the last 6 observations with the actions between them,
-SACFormer the same as tokens, and neither of them a return-to-go.
+SACFormer the same as tokens, and neither of them a return-to-go. SAC's one-step targets are there,
+too: on the seeds that were tuned on they were ahead of λ-returns with velocities hidden, behind
+them with actions delayed.
 """
 
 from __future__ import annotations
@@ -35,8 +37,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "authors": {"preset": "authors", "agent": "sacformer", "seeds": 3, **LIKE_CPU},
 }
 MEMORY_VARIANTS: dict[str, dict[str, Any]] = {
-    agent: {"preset": "memory", "agent": agent, "seeds": 5} for agent in ("sacformer", "sac")
-}
+    "sacformer": {"preset": "memory", "agent": "sacformer", "seeds": 5},
+    "sac": {"preset": "memory", "agent": "sac", "seeds": 5},
+    "sac-one-step": {
+        "preset": "memory", "agent": "sac", "seeds": 5, "td_lambda": 0.0, "learnt_steps": None,
+        "batch_size": 256,
+    },
+}  # fmt: skip
 
 
 def study(arena: str) -> Study:

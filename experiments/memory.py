@@ -56,6 +56,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "lambda-predicting": {**_LAMBDA_SEQUENCE, **PREDICTED},
     "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **PREDICTED, "state_path_width": 256},
     "belief": {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256},
+    # Of a delayed action what it will meet is foretold, too.
+    "belief-effect": {
+        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
+    },
     # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
     "belief-one-step-targets": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "td_lambda": 0.0,

@@ -153,6 +153,11 @@ class ContextConfig:
         return self.context_length if self.learnt_steps is None else self.learnt_steps
 
     @property
+    def steps_in_a_row(self) -> int:
+        """Steps that are learnt from and known to follow each other."""
+        return self.steps_to_learn if self.window == "contiguous" else 1
+
+    @property
     def window_length(self) -> int:
         """Steps of a window that is drawn from the replay."""
         return self.burn_in + self.steps_to_learn
@@ -246,6 +251,9 @@ class LearningConfig:
     prediction_weight: float = 0.0
     """Weight of the loss in predicting the next observation and the reward, as a share of their
     variance, in the actor's (sacformer); 0: it does not."""
+    prediction_steps: int | Literal["effect"] = 1
+    """Steps that are foretold; effect: up to the one in which the action comes into effect
+    (1 + action_delay), as far as a window shows them."""
     td_lambda: float = 0.0
     """λ of the critics' targets along a window: 0 for one step, towards 1 for all that follow."""
     tau: float = 0.005

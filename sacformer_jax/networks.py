@@ -57,8 +57,9 @@ class ActorOutput:
       gaussian: the action distributions.
       seen: what the actor's next call may take as its past; empty for one that sees one state.
       features: of the trunk at the states, ``[..., D]``; None of an actor without one.
-      prediction: what it expects of the action that was taken, ``[..., O + 1]``: how the
-        normalized observation changes, and the reward; None of an actor that predicts nothing.
+      prediction: what it expects of the action that was taken, ``[..., H, O + 1]``: how the
+        normalized observation changes in each of the next H steps, and the rewards; None of an
+        actor that predicts nothing.
     """
 
     gaussian: GaussianParams
@@ -136,7 +137,8 @@ class TransformerActor(nn.Module):
       state_path: widths of an MLP on the state alone, whose features go to the heads, those of the
         trunk added to them by a layer that starts at zero: the policy starts as SAC's, and learns
         what the past has to add (a residual path around the trunk). None: the trunk alone.
-      predicts: say, of states and the actions taken there, which state and reward follow.
+      predicts: H, for how many steps to say, of states and the actions taken there, which states
+        and rewards follow; 0: none.
       given: the trunk learns nothing from what is done with its features; ``state_path``, which
         there must be, sees them beside the state.
       cached: act on an episode step by step: keys and values of the K newest steps are kept in
@@ -150,7 +152,7 @@ class TransformerActor(nn.Module):
     head_init_scale: float
     tokens: Tokens = "gs"
     state_path: Sequence[int] | None = None
-    predicts: bool = False
+    predicts: int = 0
     given: bool = False
     cached: bool = False
 
@@ -192,7 +194,7 @@ class TransformerActor(nn.Module):
             features, seen = self._features(step, time_step, state_mask, deterministic, past)
         prediction = None
         if self.predicts and not self.cached:
-            prediction = self._predicted(features, action, obs.shape[-1] + 1)
+            prediction = self._predicted(features, action, (self.predicts, obs.shape[-1] + 1))
         output = jax.lax.stop_gradient(features) if self.given else features
         if self.state_path is not None:
             newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
@@ -206,13 +208,16 @@ class TransformerActor(nn.Module):
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(output), seen, features, prediction)
 
-    def _predicted(self, features: jax.Array, action: jax.Array, size: int) -> jax.Array:
-        """What the actions taken lead to, ``[B, T, size]``."""
+    def _predicted(
+        self, features: jax.Array, action: jax.Array, shape: tuple[int, int]
+    ) -> jax.Array:
+        """What the actions taken lead to, ``[B, T, *shape]``."""
         cfg = self.config
         both = jnp.concatenate([features, action], axis=-1)
         widths = (_PREDICTION_RATIO * cfg.width,)
         hidden = MLP(widths, cfg.activation, dtype=cfg.dtype, name="prediction")(both)
-        return Dense(size, nn.initializers.zeros, name="prediction_out")(hidden)
+        flat = Dense(math.prod(shape), nn.initializers.zeros, name="prediction_out")(hidden)
+        return flat.reshape(*flat.shape[:-1], *shape)  # [B, T, H, O + 1]
 
     def _features(
         self,

@@ -201,6 +201,7 @@ _MEMORY = (
             "time_embedding": "rotary",
             "transformer_loss": "prediction",
             "prediction_weight": 1.0,
+            "prediction_steps": "effect",
             "critic_features": True,
             "burn_in": 5,
             "acting_context": "episode",

@@ -204,6 +204,7 @@ def _check_past(config: Config) -> None:
         f"td_lambda={td_lambda}: a window of a single step has nothing after it; use td_lambda=0, "
         "or learnt_steps of 2 or more",
     )
+    _check_prediction_steps(config)
     _require(
         critic.critic_history == 1 or critic.critic == "mlp",
         f"critic_history={critic.critic_history}: is for critic=mlp; a transformer sees the whole "
@@ -220,6 +221,21 @@ def _check_past(config: Config) -> None:
         f"critic_history={critic.critic_history}: a window has {context.window_length + 1} states "
         f"(burn_in={context.burn_in}, {context.steps_to_learn} to learn from and one after them); "
         "use as many or fewer",
+    )
+
+
+def _check_prediction_steps(config: Config) -> None:
+    steps, in_a_row = config.learning.prediction_steps, config.context.steps_in_a_row
+    _require(
+        steps == 1 or config.learning.prediction_weight > 0,
+        f"prediction_steps={steps}: nothing is predicted; use prediction_steps=1, or "
+        "prediction_weight above 0",
+    )
+    _require(
+        steps == "effect" or 1 <= steps <= in_a_row,
+        f"prediction_steps={steps}: must be from 1 to {in_a_row}, the steps of a window that are "
+        f"learnt from and follow each other (learnt_steps={config.context.steps_to_learn}, "
+        f"window={config.context.window}), or 'effect'",
     )
 
 

@@ -454,6 +454,18 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"transformer_loss": "prediction"}, "prediction_weight=0.0"),
     ({"transformer_loss": "prediction", "prediction_weight": 1.0}, "state_path_width=0"),
     ({"prediction_weight": -1.0}, "prediction_weight=-1.0"),
+    ({"prediction_steps": "effect"}, "nothing is predicted"),
+    ({"prediction_steps": 0, "prediction_weight": 1.0}, "prediction_steps=0"),
+    ({"prediction_steps": 7, "prediction_weight": 1.0}, "from 1 to 6"),
+    (
+        {
+            "prediction_steps": 2,
+            "prediction_weight": 1.0,
+            "window": "scattered",
+            "prefill_env_steps": 100,
+        },
+        "window=scattered",
+    ),
     ({"critic_features": True, "critic": "transformer"}, "critic=mlp"),
     ({"critic_features": True, "critic_history": 2}, "critic_history=1"),
     ({"updates_per_env_step": 0}, "updates_per_env_step=0.0"),

@@ -20,6 +20,8 @@ from sacformer_jax.agents.sac_update import (
     soft_update,
     step_weights,
 )
+from sacformer_jax.agents.sacformer import predicted_steps
+from sacformer_jax.config import Config
 from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.parallel import DataAxis
@@ -28,6 +30,7 @@ from sacformer_jax.transformer import TransformerConfig
 from sacformer_jax.types import States, Window
 
 B, K = 5, 3
+EFFECT = {"prediction_steps": "effect"}
 
 
 def make_window(seed=0, context_length=K) -> Window:
@@ -327,21 +330,30 @@ def first_update(window, key, spec, **fields):
     return learner.actor_params, moved, grads, float(metrics["prediction_loss"])
 
 
-def prediction_loss(actor, params, window):
+def prediction_loss(actor, params, window, steps=1):
     """And its gradient in the actor's parameters, by NumPy and ``jax.grad``."""
-    known = np.asarray(window.bootstrap_mask & window.state_mask[:, 1:])
     # A mean over the critics' steps: of a step that terminated there is no next observation.
-    weights = np.asarray(window.weight)[:, None] * known
-    judged = (np.asarray(window.weight)[:, None] * np.asarray(window.bootstrap_mask)).sum()
+    judged = np.asarray(window.weight)[:, None] * np.asarray(window.bootstrap_mask)  # [B, K]
+    shown = np.asarray(window.state_mask[:, 1:] & window.bootstrap_mask)
     obs, reward = np.asarray(window.obs, float), np.asarray(window.reward, float)
-    outcome = np.concatenate([obs[:, 1:] - obs[:, :-1], reward[..., None]], axis=-1)
-    rows, counts = outcome.reshape(B * K, -1), weights.reshape(B * K)
-    variance = np.cov(rows.T, aweights=counts, ddof=0).diagonal()
+    parts = []  # of each step ahead: whose, the weights, what is to be foretold, its variance
+    for ahead in range(steps):
+        asked = slice(0, K - ahead)
+        weights = judged[:, asked] * shown[:, ahead:]
+        change = obs[:, 1 + ahead :] - obs[:, ahead:-1]
+        outcome = np.concatenate([change, reward[:, ahead:, None]], axis=-1)
+        rows, counts = outcome.reshape(-1, outcome.shape[-1]), weights.reshape(-1)
+        variance = np.cov(rows.T, aweights=counts, ddof=0).diagonal()
+        share_known = (judged * shown).sum() / judged.sum()
+        parts.append((asked, share_known * weights / weights.sum(), outcome, variance))
 
     def loss(params):
-        prediction = output_of(actor, params, window).prediction[:, :-1]
-        share = ((prediction - outcome) ** 2 / variance).mean(-1)
-        return (weights / judged * share).sum()
+        prediction = output_of(actor, params, window).prediction  # [B, K + 1, H, O + 1]
+        each = [
+            (weights * ((prediction[:, asked, ahead] - outcome) ** 2 / variance).mean(-1)).sum()
+            for ahead, (asked, weights, outcome, variance) in enumerate(parts)
+        ]
+        return sum(each) / steps
 
     value, grads = jax.jit(jax.value_and_grad(loss))(params)
     return float(value), grads["params"]
@@ -353,7 +365,7 @@ def test_the_actor_learns_to_predict_as_far_as_that_weighs():
     _, _, thrice, loss_thrice = first_update(window, key, spec, prediction_weight=3.0)
     assert loss_once == loss_thrice
 
-    actor = transformer(point_config(context_length=K), spec, predicts=True)
+    actor = transformer(point_config(context_length=K), spec, predicts=1)
     value, grads = prediction_loss(actor, params, window)
     assert loss_once == pytest.approx(value, rel=1e-5)
     # What is learnt besides is the same for both weights.
@@ -367,6 +379,34 @@ def test_the_actor_learns_to_predict_as_far_as_that_weighs():
     assert np.any(grads["embed_state"]["kernel"])
 
 
+def test_of_a_delayed_action_all_steps_until_its_effect_are_foretold():
+    window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
+    fields = {"prediction_weight": 1.0, "prediction_steps": "effect", "action_delay": 1}
+    params, _, _, loss = first_update(window, key, spec, **fields)
+    actor = transformer(point_config(context_length=K), spec, predicts=2)
+    assert loss == pytest.approx(prediction_loss(actor, params, window, steps=2)[0], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "steps"),
+    [
+        ({"action_delay": 2}, 1),
+        ({"prediction_steps": 4}, 4),
+        (EFFECT, 1),
+        (EFFECT | {"action_delay": 2}, 3),
+        (
+            EFFECT | {"action_delay": 2, "learnt_steps": 2, "burn_in": 4},
+            2,
+        ),  # a window shows no more
+        (EFFECT | {"action_delay": 2, "window": "scattered", "prefill_env_steps": 8_000}, 1),
+        ({"prediction_weight": 0.0}, 0),
+    ],
+)
+def test_what_is_foretold_reaches_as_far_as_the_delay(fields, steps):
+    config = Config.from_preset("cpu", **{"prediction_weight": 1.0} | fields)
+    assert predicted_steps(config) == steps
+
+
 def test_a_transformer_may_learn_from_its_prediction_alone():
     window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
     fields = {
@@ -375,7 +415,7 @@ def test_a_transformer_may_learn_from_its_prediction_alone():
     }  # fmt: skip
     params, moved, got, loss = first_update(window, key, spec, **fields, prediction_weight=3.0)
     actor = transformer(
-        point_config(context_length=K), spec, predicts=True, given=True, state_path=(8, 8)
+        point_config(context_length=K), spec, predicts=1, given=True, state_path=(8, 8)
     )
     value, wanted = prediction_loss(actor, params, window)
     assert loss == pytest.approx(value, rel=1e-5)

@@ -247,9 +247,9 @@ def test_the_arena_is_fair_and_its_seeds_are_fresh(
 
 
 def test_preset_memory_is_what_was_tuned() -> None:
-    tuned = importlib.import_module("memory").study("hidden").configs
-    for agent, variant in {"sacformer": "belief", "sac": "sac-lambda"}.items():
-        preset = Config.from_preset("memory", env="Hopper", agent=agent, hide_velocities=True)
+    tuned = importlib.import_module("memory").study("delay").configs
+    for agent, variant in {"sacformer": "belief-effect", "sac": "sac-lambda"}.items():
+        preset = Config.from_preset("memory", env="Hopper", agent=agent, action_delay=2)
         other = tuned[f"Hopper-{variant}"].flat()
         differs = {name for name, value in preset.flat().items() if other[name] != value}
         assert differs == {"preset", "total_env_steps", "seeds", "run_dir"}

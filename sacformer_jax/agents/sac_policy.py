@@ -52,7 +52,7 @@ class SACParts(OffPolicyParts):
       tune_alpha: tune α to the target entropy; otherwise it stays at ``initial_alpha``.
       initial_alpha: α at the start.
       td_lambda: λ of the critics' targets along a window.
-      prediction_weight: of the loss in predicting the next step, in the actor's; 0: none.
+      prediction_weight: of the loss in predicting the next steps, in the actor's; 0: none.
       predicts_alone: the actor's transformer learns from nothing else.
     """
 
@@ -194,8 +194,8 @@ class WindowPolicies:
     Attributes:
       now: at the K steps, ``[B, K, A]``.
       following: after them, ``[B, K, A]``.
-      prediction: ``[B, K, O + 1]``, how normalized observations change, and the rewards; None if
-        not predicted.
+      prediction: ``[B, K, H, O + 1]``, how normalized observations change in the next H steps,
+        and the rewards; None if not predicted.
       features: the trunk's at the steps and after them, ``[B, K, D]`` each; None without a trunk.
     """
 

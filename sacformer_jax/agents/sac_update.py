@@ -135,8 +135,8 @@ class _Half:
       inputs: of the critics.
       weights: of the steps.
       gaussian: π at the steps.
-      prediction: how observations change after them, and the rewards, ``[B, K, O + 1]``; None if
-        not predicted.
+      prediction: how observations change in the H steps after them, and the rewards,
+        ``[B, K, H, O + 1]``; None if not predicted.
       pull_back: takes gradients of ``gaussian`` and ``prediction`` to the actor's parameters.
       noise: standard normal ``[B, K, A]``, for the actor's loss.
     """
@@ -326,7 +326,7 @@ class _Predicted:
     """How well the next steps were foretold.
 
     Attributes:
-      grads: of the weighted loss to the prediction ``[B, K, O + 1]``; None if there is none.
+      grads: of the weighted loss to the prediction ``[B, K, H, O + 1]``; None if there is none.
       metrics: its metrics.
     """
 
@@ -335,29 +335,42 @@ class _Predicted:
 
 
 def _learn_to_predict(parts: SACParts, half: _Half, window: Window) -> _Predicted:
-    """The squared error in predicting the change of an observation and the reward, as a share of
-    their variance in the batch, mean over the numbers.
+    """The squared error in predicting the changes of the observation and the rewards, as a share
+    of their variance in the batch, mean over the numbers and over how far they lie ahead.
 
     What moves little from step to step counts as much as what moves far: in differences of
-    positions is the velocity. Steps weigh as in the critics' loss, those whose next observation is
-    not known nothing.
+    positions is the velocity. Steps weigh as in the critics' loss, those after which the window
+    does not show what happened nothing.
     """
     if half.prediction is None:
         return _Predicted(None, {})
     size, following = parts.obs_size, window.following
     known = window.state_mask[:, 1:] if following is None else following.mask
-    weight = (half.weights.critic * known)[..., None]
+    known &= window.bootstrap_mask  # the physics held
     change = half.inputs.next_obs[..., :size] - half.inputs.obs[..., :size]
-    outcome = jnp.concatenate([change, window.reward[..., None]], axis=-1)  # [B, K, O + 1]
+    one_step = jnp.concatenate([change, window.reward[..., None]], axis=-1)  # [B, K, O + 1]
+    steps = half.prediction.shape[2]
+    outcome = _ahead(one_step, steps)  # [B, K, H, O + 1]
+    weight = (half.weights.critic[..., None] * _ahead(known, steps))[..., None]  # [B, K, H, 1]
     total, first, second = parts.data.sum(
         tuple(jnp.sum(weight * x, axis=(0, 1)) for x in (jnp.ones(()), outcome, outcome**2))
     )
-    total = jnp.maximum(total, _LEAST_VARIANCE)
+    total = jnp.maximum(total, _LEAST_VARIANCE)  # [H, 1]
     variance = jnp.maximum(second / total - (first / total) ** 2, _LEAST_VARIANCE)
+    weight = weight * total[0] / total  # late steps are seen less often, and count as much
 
     def loss(prediction: jax.Array) -> jax.Array:
         share = jnp.mean((prediction - outcome) ** 2 / variance, axis=-1, keepdims=True)
-        return jnp.sum(weight * share)
+        return jnp.sum(weight * share) / steps
 
     value, grads = jax.value_and_grad(loss)(half.prediction)
     return _Predicted(parts.prediction_weight * grads, {"prediction_loss": value})
+
+
+def _ahead(x: jax.Array, steps: int) -> jax.Array:
+    """``x [B, K, ...]`` at each step and the ``steps - 1`` after it, ``[B, K, steps, ...]``; zeros
+    behind the window's end.
+    """
+    length = x.shape[1]
+    padded = jnp.pad(x, ((0, 0), (0, steps - 1), *((0, 0),) * (x.ndim - 2)))
+    return jnp.stack([padded[:, i : i + length] for i in range(steps)], axis=2)

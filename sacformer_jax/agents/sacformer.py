@@ -32,9 +32,19 @@ def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
         state_path=(settings.state_path_width,) * 2 if settings.state_path_width else None,
-        predicts=config.learning.prediction_weight > 0,
+        predicts=predicted_steps(config),
         given=settings.transformer_loss == "prediction",
     )
+
+
+def predicted_steps(config: Config) -> int:
+    """How many steps the actor foretells; 0: none."""
+    learning = config.learning
+    if learning.prediction_weight == 0:
+        return 0
+    if learning.prediction_steps == "effect":
+        return min(1 + config.task.action_delay, config.context.steps_in_a_row)
+    return learning.prediction_steps
 
 
 def acting_pairs(config: Config, spec: EnvSpec) -> int:
