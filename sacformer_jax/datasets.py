@@ -15,6 +15,7 @@ from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.envs.gym_registry import registered
 from sacformer_jax.envs.gym_wrappers import gym_wrapped_spec
 from sacformer_jax.offline import Episode
+from sacformer_jax.values import first_line
 
 
 def minari_or_refuse(what: str) -> Any:
@@ -49,7 +50,7 @@ def read_episodes(dataset: str) -> list[Episode]:
         found = _opened(minari, dataset)
     except (FileNotFoundError, ValueError, OSError, KeyError) as error:
         raise ConfigError(
-            f"{what}: is no local Minari dataset ({str(error).splitlines()[0]}); give an id that "
+            f"{what}: is no local Minari dataset ({first_line(error)}); give an id that "
             "'minari list local' shows (get one by 'minari download'), or its folder"
         ) from error
     for name in ("observation", "action"):

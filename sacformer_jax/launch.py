@@ -9,6 +9,7 @@ import jax
 
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.population import Devices
+from sacformer_jax.values import first_line
 
 _NARROW = 64
 """Width of layers up to which a second thread of XLA's did not help PPO, with 1 to 64 environments;
@@ -51,10 +52,10 @@ class Launch:
         try:
             jax.distributed.initialize(self.coordinator, self.num_processes, self.process_id)
         except (RuntimeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
             raise ConfigError(
-                f"distributed=True: the other processes cannot be found ({reason}); outside SLURM, "
-                "Open MPI and Cloud TPU give --coordinator, --num-processes and --process-id"
+                f"distributed=True: the other processes cannot be found ({first_line(error)}); "
+                "outside SLURM, Open MPI and Cloud TPU give --coordinator, --num-processes and "
+                "--process-id"
             ) from error
 
     def devices(self, num_members: int) -> Devices:

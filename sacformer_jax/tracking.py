@@ -18,6 +18,7 @@ from sacformer_jax.callbacks import Callback, Event, RunStart
 from sacformer_jax.config import ConfigError
 from sacformer_jax.logging import Record
 from sacformer_jax.results import RunResult
+from sacformer_jax.values import first_line
 
 WandbMode = Literal["online", "offline"]
 _NOT_METRICS = ("kind", "env_steps", "updates", "member")
@@ -107,7 +108,7 @@ class WandbTracker(Callback):
                 )
             except self._wandb.errors.Error as error:
                 raise ConfigError(
-                    f"wandb_mode={self.mode!r}: {_first_line(error)}; log in with 'wandb login', "
+                    f"wandb_mode={self.mode!r}: {first_line(error)}; log in with 'wandb login', "
                     "or use wandb_mode=offline"
                 ) from error
             started.define_metric("env_steps")
@@ -141,7 +142,7 @@ class WandbTracker(Callback):
         except Exception as error:
             if not self._failed:
                 warnings.warn(
-                    f"Weights & Biases: {_first_line(error)}; training goes on, and everything is "
+                    f"Weights & Biases: {first_line(error)}; training goes on, and everything is "
                     f"in {self._path}",
                     stacklevel=2,
                 )
@@ -179,7 +180,3 @@ def _named(kind: str, record: Record) -> Record:
         for name, value in record.items()
         if name not in _NOT_METRICS and value is not None
     }
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -20,6 +20,11 @@ def unknown(what: str, name: str, known: Any) -> str:
     return f"{what} {name!r} does not exist; {hint}"
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, or its type where it has none."""
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
 def _alternatives(union: Any) -> tuple[tuple[Any, ...], Any]:
     """The words (or None) and the one number type that a union allows."""
     words: list[Any] = []
