@@ -76,7 +76,8 @@ SAC: dict[str, dict[str, Any]] = {
     "sac-lambda-norm": {**_WINDOWS, "td_lambda": 0.5, "critic_layer_norm": True},
 }
 FURTHER = (
-    "sacformer", "lambda-path", "larger-path-no-time", "sac", "sac-lambda", "sac-lambda-larger",
+    "sacformer", "lambda-path", "larger-path-no-time", "lambda-belief-states", "sac", "sac-lambda",
+    "sac-lambda-larger",
 )  # fmt: skip
 """Variants that are trained on all four tasks."""
 
