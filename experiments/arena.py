@@ -39,11 +39,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 MEMORY_VARIANTS: dict[str, dict[str, Any]] = {
     "sacformer": {"preset": "memory", "agent": "sacformer", "seeds": 5},
     "sac": {"preset": "memory", "agent": "sac", "seeds": 5},
-    "sac-one-step": {
-        "preset": "memory", "agent": "sac", "seeds": 5, "td_lambda": 0.0, "learnt_steps": None,
-        "batch_size": 256,
-    },
-}  # fmt: skip
+    "sac-one-step": {"preset": "cpu", **memory.VARIANTS["sac"], "seeds": 5},
+}
 
 
 def study(arena: str) -> Study:

@@ -336,6 +336,7 @@ def prediction_loss(actor, params, window, steps=1):
     judged = np.asarray(window.weight)[:, None] * np.asarray(window.bootstrap_mask)  # [B, K]
     shown = np.asarray(window.state_mask[:, 1:] & window.bootstrap_mask)
     obs, reward = np.asarray(window.obs, float), np.asarray(window.reward, float)
+    share_known = (judged * shown).sum() / judged.sum()
     parts = []  # of each step ahead: whose, the weights, what is to be foretold, its variance
     for ahead in range(steps):
         asked = slice(0, K - ahead)
@@ -344,7 +345,6 @@ def prediction_loss(actor, params, window, steps=1):
         outcome = np.concatenate([change, reward[:, ahead:, None]], axis=-1)
         rows, counts = outcome.reshape(-1, outcome.shape[-1]), weights.reshape(-1)
         variance = np.cov(rows.T, aweights=counts, ddof=0).diagonal()
-        share_known = (judged * shown).sum() / judged.sum()
         parts.append((asked, share_known * weights / weights.sum(), outcome, variance))
 
     def loss(params):
@@ -394,10 +394,8 @@ def test_of_a_delayed_action_all_steps_until_its_effect_are_foretold():
         ({"prediction_steps": 4}, 4),
         (EFFECT, 1),
         (EFFECT | {"action_delay": 2}, 3),
-        (
-            EFFECT | {"action_delay": 2, "learnt_steps": 2, "burn_in": 4},
-            2,
-        ),  # a window shows no more
+        # A window shows no more.
+        (EFFECT | {"action_delay": 2, "learnt_steps": 2, "burn_in": 4}, 2),
         (EFFECT | {"action_delay": 2, "window": "scattered", "prefill_env_steps": 8_000}, 1),
         ({"prediction_weight": 0.0}, 0),
     ],
