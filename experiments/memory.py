@@ -60,6 +60,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "belief-effect": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
     },
+    # A third of the tokens, which tell the same.
+    "belief-joint": {
+        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
+        "tokens": "joint",
+    },
     # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
     "belief-one-step-targets": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "td_lambda": 0.0,

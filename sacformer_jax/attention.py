@@ -18,6 +18,7 @@ from sacformer_jax.agents.sacformer import acting_pairs, make_actor
 from sacformer_jax.config import Config
 from sacformer_jax.context import commanded_return_to_go
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.networks import STEP_TOKENS
 from sacformer_jax.types import Context, PolicyState
 
 
@@ -34,8 +35,9 @@ def acting_attention(
 
     Returns:
       ``[L, H, T, P, n]``, rows over the last two axes that sum to 1: how much goes to the tokens
-      (return-to-go, state, with ``tokens="gsa"`` the action) of the pair p steps back, P being the
-      pairs that acting sees at most, or T; and ``[T, A]`` the mean before tanh, as in acting.
+      (return-to-go, state, with ``tokens="gsa"`` the action; with ``"joint"`` one) of the pair p
+      steps back, P being the pairs that acting sees at most, or T; and ``[T, A]`` the mean before
+      tanh, as in acting.
     """
     contexts = dataclasses.replace(contexts, cache={})
     if config.context.acting_context == "window":
@@ -91,11 +93,12 @@ def _look(
         mutable=["intermediates"],
     )
     output, looked = result
-    n, length = len(config.context.tokens), contexts.mask.shape[1]
+    tokens, length = STEP_TOKENS[config.context.tokens], contexts.mask.shape[1]
+    n = len(tokens.names)
     layers = []
     for i in range(config.actor.actor_layers):
         weights = looked["intermediates"]["trunk"][f"block_{i}"]["attention"][0]  # [B, H, ., nK]
-        if weights.shape[2] != length:  # of every token; the states are the second ones
-            weights = weights[:, :, 1::n]
+        if weights.shape[2] != length:  # of every token
+            weights = weights[:, :, tokens.state :: n]
         layers.append(weights.reshape(*weights.shape[:3], length, n))
     return _Looked(jnp.stack(layers), output.gaussian.mean)

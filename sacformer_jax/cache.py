@@ -23,20 +23,24 @@ class CachePlaces:
     mask: jax.Array
 
 
-def cache_places(time_step: jax.Array, num_tokens: int, context_length: int) -> CachePlaces:
+def cache_places(
+    time_step: jax.Array, num_tokens: int, state_token: int, context_length: int
+) -> CachePlaces:
     """The places of an episode's tokens ``(G_0, S_0, [A_0,] G_1, …)`` in a ring.
 
-    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with actions
-    one more, since A_{t-1} comes with step t and sees a step that S_t no longer does.
+    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with tokens
+    behind the state, as that of the action, one more: A_{t-1} comes with step t and sees a step
+    that S_t no longer does.
 
     Args:
       time_step: int32 ``[B]``, t of the newest state.
-      num_tokens: n, 2 or 3 a step; the newest are ``G_t, S_t``, after ``A_{t-1}`` with 3.
+      num_tokens: n of a step; the newest n are those up to the one of the state.
+      state_token: which of a step's tokens stands for the state, from 0.
       context_length: how many steps a token sees, its own included.
     """
-    n = num_tokens
-    size = (context_length + n - 2) * n
-    new = time_step[:, None] * n + jnp.arange(2 - n, 2)  # [B, n]
+    n, behind = num_tokens, num_tokens - 1 - state_token
+    size = (context_length + behind) * n
+    new = time_step[:, None] * n + jnp.arange(-behind, n - behind)  # [B, n]
     newest = new[:, -1:]
     # The number of the token that lies at each place; below 0 it is none of this episode.
     held = newest - (newest - jnp.arange(size)) % size  # [B, C]

@@ -22,7 +22,7 @@ EngineName = Literal["auto", "native", "mjx"]
 MjxPreset = Literal["parity", "fast"]
 MjxImpl = Literal["jax", "warp"]
 BraxBackend = Literal["spring", "positional", "generalized", "mjx"]
-Tokens = Literal["gs", "gsa"]
+Tokens = Literal["gs", "gsa", "joint"]
 ComputeDtype = Literal["float32", "bfloat16"]
 ActingContext = Literal["window", "episode"]
 WindowKind = Literal["contiguous", "scattered"]
@@ -143,7 +143,8 @@ class ContextConfig:
     rtg_discount: float = 0.99
     """Discount of hindsight return-to-go; 1 for none."""
     tokens: Tokens = "gs"
-    """Tokens of a step: return-to-go and state (gs), or the action taken there too (gsa)."""
+    """Tokens of a step: return-to-go and state (gs), the action taken there too (gsa), or a single
+    one for the return-to-go, the state and the action before it (joint)."""
     normalize_obs: bool = False
     """Normalize observations by their running mean and variance."""
 

@@ -33,6 +33,27 @@ KERNEL_INITS = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class StepTokens:
+    """What a step's tokens stand for.
+
+    Attributes:
+      names: in order.
+      state: the place of the one whose features tell of the state; those behind it are seen from
+        the next step on.
+    """
+
+    names: tuple[str, ...]
+    state: int
+
+
+STEP_TOKENS: dict[Tokens, StepTokens] = {
+    "gs": StepTokens(("return", "state"), 1),
+    "gsa": StepTokens(("return", "state", "action"), 1),
+    "joint": StepTokens(("joint",), 0),
+}
+
+
 def max_time_step(spec: EnvSpec) -> int:
     """How many time steps there are: the state after an episode's last step has one too."""
     return spec.max_episode_steps + 1
@@ -125,10 +146,12 @@ class TransformerActor(nn.Module):
     """The Decision-Transformer actor over ``(G_1, S_1, …, G_T, S_T)`` (paper, section 3.1).
 
     With ``tokens="gsa"`` over ``(G_1, S_1, A_1, …)``, as Decision Transformer (arXiv 2106.01345).
+    With ``"joint"`` over ``((G_1, S_1), (G_2, S_2, A_1), …)``, as many recurrent agents see the
+    past: a token a step, of all that is known there.
 
     Attributes:
       config: the trunk.
-      tokens: ``"gs"`` or ``"gsa"``.
+      tokens: one of :data:`STEP_TOKENS`.
       action_size: A.
       context_length: K; no position attends to more than K pairs.
       max_time_step: size of the time-step embedding; None: tokens have none, and know of their time
@@ -166,13 +189,15 @@ class TransformerActor(nn.Module):
         state_mask: jax.Array,
         deterministic: bool = True,
         past: Seen | None = None,
+        skip: int = 0,
     ) -> ActorOutput:
         """Action distributions at every state; with a cache, at the newest one alone.
 
         Args:
           obs: ``[B, T, O]``, normalized.
           action: ``[B, T, A]``, the actions taken; each is seen from the next state on, the last
-            one by nobody of these, and none at all with ``tokens="gs"``.
+            one by nobody of these, and none at all with ``tokens="gs"``. With a past
+            ``[B, P + T, A]``, as ``state_mask``.
           return_to_go: ``[B, T]``, scaled.
           time_step: int32 ``[B, T]``; with a cache, each call must be one step after the one
             before, or 0, where the cache starts anew.
@@ -180,24 +205,26 @@ class TransformerActor(nn.Module):
             ``[B, P + T]``, its P pairs first.
           deterministic: dropout off; otherwise the rng ``dropout`` is used.
           past: what an earlier call left, about the P pairs before these.
+          skip: of how many first states nothing is asked: they are only seen by those after them,
+            and zeros are returned for them.
 
         Returns:
           mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing. With a
           cache ``[B, 1, A]``, and nothing is predicted.
         """
-        step = {"return": return_to_go[..., None], "state": obs}
-        if self.tokens == "gsa":
-            step["action"] = action
+        step = self._step(obs, action, return_to_go, state_mask)
         if self.cached:
             features, seen = self._newest_features(step, time_step, deterministic)
         else:
-            features, seen = self._features(step, time_step, state_mask, deterministic, past)
+            features, seen = self._features(step, time_step, state_mask, deterministic, past, skip)
+        asked = features.shape[1]  # T - skip; with a cache 1
         prediction = None
         if self.predicts and not self.cached:
-            prediction = self._predicted(features, action, (self.predicts, obs.shape[-1] + 1))
+            shape = (self.predicts, obs.shape[-1] + 1)
+            prediction = self._predicted(features, action[:, -asked:], shape)
         output = jax.lax.stop_gradient(features) if self.given else features
         if self.state_path is not None:
-            newest = obs[:, -features.shape[1] :]  # with a cache the last one alone
+            newest = obs[:, -asked:]
             activation, dtype = self.config.activation, self.config.dtype
             path = MLP(self.state_path, activation, dtype=dtype, name="state_path")
             if self.given:
@@ -206,7 +233,24 @@ class TransformerActor(nn.Module):
                 by_state, zeros = path(newest), nn.initializers.zeros
                 output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(output)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
-        return ActorOutput(heads(output), seen, features, prediction)
+        gaussian, features, prediction = jax.tree.map(
+            lambda x: jnp.pad(x, ((0, 0), (skip, 0), *((0, 0),) * (x.ndim - 2))),
+            (heads(output), features, prediction),
+        )
+        return ActorOutput(gaussian, seen, features, prediction)
+
+    def _step(
+        self, obs: jax.Array, action: jax.Array, return_to_go: jax.Array, state_mask: jax.Array
+    ) -> dict[str, jax.Array]:
+        """What each of a step's tokens stands for, by name."""
+        states = obs.shape[1]
+        step = {"return": return_to_go[..., None], "state": obs}
+        if self.tokens == "gsa":
+            step["action"] = action[:, -states:]
+        elif self.tokens == "joint":
+            before = _action_before(action, state_mask)[:, -states:]
+            step = {"joint": jnp.concatenate([*step.values(), before], axis=-1)}
+        return step
 
     def _predicted(
         self, features: jax.Array, action: jax.Array, shape: tuple[int, int]
@@ -226,8 +270,9 @@ class TransformerActor(nn.Module):
         state_mask: jax.Array,
         deterministic: bool,
         past: Seen | None,
+        skip: int,
     ) -> tuple[jax.Array, Seen]:
-        """What the trunk makes of the state tokens, ``[B, T, D]``."""
+        """What the trunk makes of the state tokens but the first, ``[B, T - skip, D]``."""
         n, states = len(step), time_step.shape[1]
         tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)
 
@@ -236,8 +281,8 @@ class TransformerActor(nn.Module):
         token_mask = jnp.repeat(jnp.repeat(step_mask, n, axis=1), n, axis=2)  # [B, nT, nT]
         place = jnp.arange(token_mask.shape[1])
         token_mask &= place[:, None] >= place  # by comparison: ONNX's runtime selects no booleans
-        # State tokens are the second ones.
-        trunk = Transformer(self.config, kept=(1, n), name="trunk")
+        kept = (skip * n + STEP_TOKENS[self.tokens].state, n)
+        trunk = Transformer(self.config, kept, name="trunk")
         newest = token_mask[:, -n * states :]  # all of them, but for those of the past
         time = jnp.repeat(time_step, n, axis=1)  # [B, nT]
         return trunk(tokens, newest, deterministic, past=past, time=time)
@@ -246,18 +291,26 @@ class TransformerActor(nn.Module):
         self, step: dict[str, jax.Array], time_step: jax.Array, deterministic: bool
     ) -> tuple[jax.Array, Seen]:
         """The same of the newest state token alone, ``[B, 1, D]``, by way of the cache."""
-        n = len(step)
-        # What is new since the last call: the action taken then (if seen), return and state.
-        step = {name: values[:, 1 - n :] for name, values in step.items()}
-        steps = time_step[:, 1 - n :]
+        n, place = len(step), STEP_TOKENS[self.tokens].state
+        behind = n - 1 - place
+        # What is new since the last call: what lay behind the state then, and up to the state now.
+        num_steps = 2 if behind else 1
+        step = {name: values[:, -num_steps:] for name, values in step.items()}
+        steps = time_step[:, -num_steps:]
         tokens = embed_steps(step, steps, self.config.width, self.max_time_step)
-        places = cache_places(time_step[:, -1], n, self.context_length)
-        # With actions: (G, S, [A, G, S], A); without: ([G, S]).
-        first = n * (n - 2) + 2 - n
-        new_tokens = tokens[:, first:][:, :n]  # [B, n, D]
-        time = jnp.repeat(steps, n, axis=1)[:, first:][:, :n]  # [B, n]
+        places = cache_places(time_step[:, -1], n, place, self.context_length)
+        # (G, S, [A, G, S], A), ([G, S]) or ([J]).
+        new = slice((num_steps - 1) * n - behind, num_steps * n - behind)
+        new_tokens = tokens[:, new]  # [B, n, D]
+        time = jnp.repeat(steps, n, axis=1)[:, new]  # [B, n]
         trunk = Transformer(self.config, kept=(n - 1, n), name="trunk")
         return trunk(new_tokens, places.mask, deterministic, places.positions, time=time)
+
+
+def _action_before(action: jax.Array, state_mask: jax.Array) -> jax.Array:
+    """The action that led to each state, ``[B, T, A]``; zero where none is known."""
+    known = jnp.where(state_mask[:, :-1, None], action[:, :-1], 0.0)
+    return jnp.pad(known, ((0, 0), (1, 0), (0, 0)))
 
 
 class MLP(nn.Module):
@@ -307,8 +360,9 @@ class MLPActor(nn.Module):
         state_mask: jax.Array,
         deterministic: bool = True,
         past: Seen | None = None,
+        skip: int = 0,
     ) -> ActorOutput:
-        del action, return_to_go, time_step, state_mask, deterministic, past
+        del action, return_to_go, time_step, state_mask, deterministic, past, skip
         features = MLP(self.widths, self.activation, dtype=self.dtype, name="mlp")(obs)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
         return ActorOutput(heads(features), ())

@@ -17,6 +17,7 @@ from sacformer_jax.config import ConfigError
 from sacformer_jax.diagnostics import achieved_returns, attention_map, diagnostics_sheet
 from sacformer_jax.evaluate import Episodes, make_evaluator
 from sacformer_jax.logging import Record, read_records
+from sacformer_jax.networks import STEP_TOKENS
 from sacformer_jax.plots import comparison, learning_curve
 from sacformer_jax.policy import Policy, load_policy
 from sacformer_jax.policy_renderer import is_return_conditioned
@@ -29,7 +30,6 @@ TARGETS = (0.25, 0.5, 0.75, 1.0, 1.25)
 """Target returns that are tried, over that of training."""
 MAX_PAIRS = 50
 """Pairs that an attention map shows by themselves."""
-_TOKENS = {"g": "return-to-go", "s": "state", "a": "action"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,7 +182,7 @@ def draw_policy(policy: Policy, to: Path, episodes: int, seed: int, title: str) 
         achieved_returns(targets, returns, target, to / "target_return.png", title)
         yield to / "target_return.png"
     shown = mean_attention(policy, seed)
-    tokens = [_TOKENS[letter] for letter in policy.config.context.tokens]
+    tokens = STEP_TOKENS[policy.config.context.tokens].names
     attention_map(shown.attention, tokens, shown.older, to / "attention.png", title)
     yield to / "attention.png"
 

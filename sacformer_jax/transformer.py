@@ -73,11 +73,12 @@ class Block(nn.Module):
 
     Attributes:
       config: the trunk's.
-      kept: ``(first, step)``: compute only these tokens; all are still attended to.
+      kept: ``(first, step)``: compute only these tokens; all are still attended to. Queries have a
+        layer of their own then, even where those are all. None: every token, by one layer.
     """
 
     config: TransformerConfig
-    kept: tuple[int, int] = EVERY_TOKEN
+    kept: tuple[int, int] | None = None
 
     @nn.compact
     def __call__(
@@ -98,9 +99,9 @@ class Block(nn.Module):
             return Dense(size, nn.initializers.normal(0.02), cfg.dtype, name=name)
 
         normed = LayerNorm(name="ln_1")(x)
-        if self.kept != EVERY_TOKEN:
-            first, step = self.kept
-            kept = slice(first, None, step)
+        kept = slice(None)
+        if self.kept is not None:
+            kept = slice(self.kept[0], None, self.kept[1])
             x, queries, mask = x[:, kept], normed[:, kept], mask[:, kept]
             q = project(width, "query")(queries)
             k, v = jnp.split(project(2 * width, "key_value")(normed), 2, axis=-1)
@@ -113,8 +114,7 @@ class Block(nn.Module):
         q, k, v = split_heads(q), split_heads(k), split_heads(v)
         if cfg.rotary:
             assert time is not None
-            first, step = self.kept
-            q, k = rotated(q, time[:, first::step]), rotated(k, time)
+            q, k = rotated(q, time[:, kept]), rotated(k, time)
         seen = KeysValues(k, v)
         if positions is not None:
             seen = KeysValues(
@@ -188,7 +188,7 @@ class Transformer(nn.Module):
         x = dropout(x)
         seen = []
         for i in range(cfg.layers):
-            kept = self.kept if i == cfg.layers - 1 else EVERY_TOKEN
+            kept = self.kept if i == cfg.layers - 1 else None
             before = None if past is None else past[i]
             block = Block(cfg, kept, name=f"block_{i}")
             x, block_seen = block(x, mask, dropout, positions, before, time)

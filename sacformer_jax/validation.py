@@ -263,9 +263,8 @@ def _check_window(config: Config) -> None:
         f"agent={config.agent} sees one state; use window=contiguous, or agent=sacformer": (
             config.agent not in MLP_AGENTS
         ),
-        "with tokens=gsa an action must stand before the state it led to; use tokens=gs": (
-            context.tokens == "gs"
-        ),
+        f"with tokens={context.tokens} an action must stand before the state it led to; use "
+        "tokens=gs": context.tokens == "gs",
         "critic=transformer needs the steps before the one it judges; use critic=mlp": (
             config.critic.critic == "mlp"
         ),

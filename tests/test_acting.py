@@ -28,18 +28,18 @@ from sacformer_jax.types import Acted
 OBS, ACT, ENVS = 3, 2, 2
 
 
-@pytest.mark.parametrize("num_tokens", [2, 3])
+@pytest.mark.parametrize("kinds", ["J", "GS", "GSA"])
 @pytest.mark.parametrize("band", [1, 3, 20])
-def test_places_in_the_ring_by_simulation(num_tokens, band):
+def test_places_in_the_ring_by_simulation(kinds, band):
     """A ring kept token by token in Python, over two episodes of one environment."""
-    n, size = num_tokens, (band + num_tokens - 2) * num_tokens
-    ring = [None] * size  # (episode, step, kind) at each place
-    order = {"G": 0, "S": 1, "A": 2}
+    n, state = len(kinds), min(1, len(kinds) - 1)
+    ring = [None] * (band + (n == 3)) * n  # (episode, step, kind) at each place
     for episode, length in enumerate((11, 9)):
         for t in range(length):
-            places = cache_places(jnp.array([t]), n, band)
+            places = cache_places(jnp.array([t]), n, state, band)
             positions, mask = np.asarray(places.positions)[0], np.asarray(places.mask)[0]
-            new = [(t, "G"), (t, "S")] if n == 2 else [(t - 1, "A"), (t, "G"), (t, "S")]
+            new = [(t - 1, kind) for kind in kinds[state + 1 :]]
+            new += [(t, kind) for kind in kinds[: state + 1]]
             for place, (step, kind) in zip(positions, new, strict=True):
                 ring[place] = (episode, step, kind)
             for row, (step, kind) in enumerate(new):
@@ -49,8 +49,8 @@ def test_places_in_the_ring_by_simulation(num_tokens, band):
                 expected = {
                     (episode, s, k)
                     for s in range(max(0, step - band + 1), step + 1)
-                    for k in "GSA"[:n]
-                    if s < step or order[k] <= order[kind]
+                    for k in kinds
+                    if s < step or kinds.index(k) <= kinds.index(kind)
                 }
                 assert seen == expected, (t, kind)
 
@@ -120,6 +120,8 @@ def all_at_once(config, spec, policy, obs, actions, rewards, band):
         pytest.param("gs", 1000, {}, marks=pytest.mark.slow),
         pytest.param("gsa", 1000, {}, marks=pytest.mark.slow),
         ("gsa", 100, {"time_embedding": "rotary", "state_path_width": 8}),
+        ("joint", 100, {"time_embedding": "rotary"}),
+        pytest.param("joint", 1000, {}, marks=pytest.mark.slow),
         pytest.param(
             "gsa",
             100,
@@ -173,12 +175,15 @@ def test_the_cache_holds_the_episode_and_no_more():
     assert shapes == {(5, 2, 60, 8)}  # N, heads, two tokens a step, width of a head
     agent, _, _ = make_agent(acting_config(acting_context_limit=10, tokens="gsa"), 30)
     assert {x.shape for x in jax.tree.leaves(agent.init_cache(5))} == {(5, 2, 33, 8)}
+    agent, _, _ = make_agent(acting_config(acting_context_limit=10, tokens="joint"), 30)
+    assert {x.shape for x in jax.tree.leaves(agent.init_cache(5))} == {(5, 2, 10, 8)}
     agent, _, _ = make_agent(acting_config(acting_context="window"), 30)
     assert jax.tree.leaves(agent.init_cache(5)) == []
 
 
-def test_a_policy_object_acts_on_its_whole_episode():
-    config = acting_config(tokens="gsa")
+@pytest.mark.parametrize("tokens", ["gsa", "joint"])
+def test_a_policy_object_acts_on_its_whole_episode(tokens):
+    config = acting_config(tokens=tokens)
     agent, spec, state = make_agent(config, 60)
     policy = Policy(config, spec, agent, state)
     rng = np.random.default_rng(1)

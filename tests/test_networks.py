@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -48,13 +49,22 @@ def oracle(params, inputs, layers, heads, band, tokens="gs", rotary=False):
     for b in range(BATCH):
         steps = inputs["time_step"][b]
         time = params["embed_time"]["embedding"][steps] if "embed_time" in params else 0.0
-        g = dense(inputs["return_to_go"][b][:, None].astype(float), params["embed_return"]) + time
-        s = dense(inputs["obs"][b].astype(float), params["embed_state"]) + time
-        states, n = len(steps), len(tokens)
-        x = np.empty((n * states, g.shape[1]))
-        x[0::n], x[1::n] = g, s
-        if tokens == "gsa":
-            x[2::n] = dense(inputs["action"][b].astype(float), params["embed_action"]) + time
+        states, n = len(steps), 1 if tokens == "joint" else len(tokens)
+        if tokens == "joint":
+            before = np.zeros((states, ACT))
+            for t in range(1, states):
+                before[t] = inputs["action"][b, t - 1] * inputs["state_mask"][b, t - 1]
+            known = [inputs["return_to_go"][b][:, None], inputs["obs"][b], before]
+            x = dense(np.concatenate(known, axis=1).astype(float), params["embed_joint"]) + time
+        else:
+            x = np.empty((n * states, params["trunk"]["ln_f"]["scale"].shape[0]))
+            x[0::n] = dense(
+                inputs["return_to_go"][b][:, None].astype(float), params["embed_return"]
+            )
+            x[1::n] = dense(inputs["obs"][b].astype(float), params["embed_state"])
+            if tokens == "gsa":
+                x[2::n] = dense(inputs["action"][b].astype(float), params["embed_action"])
+            x += np.repeat(np.broadcast_to(time, (states, x.shape[1])), n, axis=0)
         x = layer_norm(x, params["ln_embed"])
         allowed = np.zeros((n * states, n * states), bool)
         for i in range(n * states):
@@ -65,7 +75,7 @@ def oracle(params, inputs, layers, heads, band, tokens="gs", rotary=False):
         for layer in range(layers):
             block, when = params["trunk"][f"block_{layer}"], np.repeat(steps, n)
             x = gpt2_block(x, block, heads, allowed, when if rotary else None)
-        x = layer_norm(x, params["trunk"]["ln_f"])[1::n]
+        x = layer_norm(x, params["trunk"]["ln_f"])[min(1, n - 1) :: n]
         if "state_path" in params:
             by_state = inputs["obs"][b].astype(float)
             for name in ("dense_0", "dense_1"):
@@ -85,6 +95,8 @@ def oracle(params, inputs, layers, heads, band, tokens="gs", rotary=False):
         (3, 1, K + 1, "gsa", None, "absolute"),
         (1, 2, K, "gsa", (12, 10), "absolute"),
         (2, 2, K + 1, "gsa", None, "rotary"),
+        (2, 2, K + 1, "joint", None, "absolute"),
+        (1, 2, K, "joint", (12, 10), "rotary"),
     ],
 )
 def test_actor_equals_the_numpy_decision_transformer(
@@ -102,7 +114,7 @@ def test_actor_equals_the_numpy_decision_transformer(
     assert (log_std[real] < 2.0).any()  # the clip is not all there is
 
 
-@pytest.fixture(scope="module", params=["gs", "gsa"])
+@pytest.fixture(scope="module", params=["gs", "gsa", "joint"])
 def trained(request):
     """A one-block actor, where the band is the whole receptive field."""
     actor = make_actor(layers=1, tokens=request.param)
@@ -129,17 +141,19 @@ def test_step_t_does_not_depend_on_later_steps(trained):
 def test_actions_are_seen_from_the_next_step_on_if_at_all(trained):
     apply, params, inputs = trained
     before = apply(params, **inputs).mean
-    seen = "embed_action" in params["params"]
+    # The joint token of the oldest state in sight holds the action before it, too.
+    joint = "embed_joint" in params["params"]
+    seen, last = joint or "embed_action" in params["params"], K + joint
     for t in range(K + 2):
         action = inputs["action"].copy()
         action[:, t] += 1.0
         after = apply(params, **{**inputs, "action": action}).mean
         differs = (np.asarray(after) != np.asarray(before)).any(axis=(0, 2))
         steps = np.arange(K + 2)
-        np.testing.assert_array_equal(differs, seen & (steps > t) & (steps < t + K))
+        np.testing.assert_array_equal(differs, seen & (steps > t) & (steps < t + last))
 
 
-@pytest.mark.parametrize("tokens", ["gs", "gsa"])
+@pytest.mark.parametrize("tokens", ["gs", "gsa", "joint"])
 def test_bfloat16_is_close_and_keeps_its_parameters_in_float32(tokens):
     inputs = make_inputs()
     actors = [make_actor(tokens=tokens), make_actor(tokens=tokens)]
@@ -220,7 +234,9 @@ def test_dropout_is_on_only_where_asked_for():
     np.testing.assert_array_equal(mean(jax.random.key(0)), mean(jax.random.key(0)))
 
 
-@pytest.mark.parametrize(("tokens", "time"), [("gs", "absolute"), ("gsa", "rotary")])
+@pytest.mark.parametrize(
+    ("tokens", "time"), [("gs", "absolute"), ("gsa", "rotary"), ("joint", "rotary")]
+)
 def test_a_state_with_a_past_is_as_in_one_pass(tokens, time):
     actor = make_actor(heads=2, tokens=tokens, time=time)
     inputs = make_inputs(K + 1)
@@ -232,13 +248,31 @@ def test_a_state_with_a_past_is_as_in_one_pass(tokens, time):
         first = {name: value[:, :K] for name, value in inputs.items()}
         last = {name: value[:, K:] for name, value in inputs.items()}
         before = actor.apply(params, **first)
-        last["state_mask"] = inputs["state_mask"]
+        last |= {name: inputs[name] for name in ("state_mask", "action")}
         return before.gaussian, actor.apply(params, **last, past=before.seen).gaussian
 
     before, after = apart(params)
     for name in ("mean", "log_std"):
         parts = np.concatenate([getattr(before, name), getattr(after, name)], axis=1)
         np.testing.assert_allclose(parts, getattr(together, name), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("tokens", ["gs", "gsa", "joint"])
+@pytest.mark.parametrize("state_path", [None, (12, 12)])
+def test_states_that_nothing_is_asked_of_are_seen_all_the_same(tokens, state_path):
+    actor = make_actor(tokens=tokens, heads=2, state_path=state_path).clone(predicts=2)
+    inputs = make_inputs(K + 1)
+    params = randomized(jax.jit(actor.init)(jax.random.key(0), **inputs))
+    asked = jax.jit(actor.apply)(params, **inputs)
+    some = jax.jit(functools.partial(actor.apply, skip=2))(params, **inputs)
+    said = [(output.gaussian, output.features, output.prediction) for output in (some, asked)]
+    for one, every in zip(*map(jax.tree.leaves, said), strict=True):
+        np.testing.assert_allclose(one[:, 2:], every[:, 2:], rtol=1e-5, atol=1e-5)
+        assert not one[:, :2].any()
+        assert every[:, :2].any()
+    # What comes after may still look at all of them.
+    for one, every in zip(*map(jax.tree.leaves, (some.seen, asked.seen)), strict=True):
+        np.testing.assert_allclose(one, every, rtol=1e-5, atol=1e-5)
 
 
 def test_with_a_path_around_it_the_trunk_starts_with_nothing_to_say_and_learns():

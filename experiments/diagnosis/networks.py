@@ -18,11 +18,10 @@ from sacformer_jax.agents.sac_policy import acting_outlook, window_policies
 from sacformer_jax.agents.sac_update import critic_inputs
 from sacformer_jax.attention import acting_attention
 from sacformer_jax.critics import CriticInputs
-from sacformer_jax.networks import MLP
+from sacformer_jax.networks import MLP, STEP_TOKENS
 from sacformer_jax.transformer import ACTIVATIONS, Block
 from sacformer_jax.types import Context, Window
 
-TOKENS = {"g": "return", "s": "state", "a": "action"}
 _HEADS = ("heads", "q")
 """Layers whose input counts as a network's features."""
 
@@ -50,8 +49,8 @@ def attention_numbers(subject: Subject, windows: Window) -> dict[str, float]:
         numbers[f"{name}/earlier"] = float(rows[1:].sum())
         numbers[f"{name}/mean_steps_back"] = float(rows.sum(axis=1) @ np.arange(len(rows)))
         for back, row in enumerate(rows):
-            for token, value in zip(config.context.tokens, row, strict=True):
-                numbers[f"{name}/{back}_back/{TOKENS[token]}"] = float(value)
+            for token, value in zip(STEP_TOKENS[config.context.tokens].names, row, strict=True):
+                numbers[f"{name}/{back}_back/{token}"] = float(value)
     return numbers
 
 

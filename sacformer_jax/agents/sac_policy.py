@@ -45,6 +45,7 @@ class SACParts(OffPolicyParts):
     Attributes:
       acting_actor: the same network, as it acts: with a cache or without.
       distribution: the policy's distribution over the action bounds.
+      burn_in: first steps of a window that are seen by those after them, and no more.
       return_conditioning: what the actor is conditioned on in training.
       next_rtg_decrement: hindsight return-to-go after a scattered step is that at the step less
         this; None: its own.
@@ -58,6 +59,7 @@ class SACParts(OffPolicyParts):
 
     acting_actor: nn.Module
     distribution: ActionDistribution
+    burn_in: int
     return_conditioning: Conditioning
     next_rtg_decrement: float | None
     acting_dropout: bool
@@ -90,6 +92,7 @@ def sac_parts(
         obs_size=spec.obs_size,
         action_size=spec.action_size,
         context_length=config.context.context_length,
+        burn_in=config.context.burn_in,
         return_conditioning=config.context.return_conditioning,
         next_rtg_decrement=config.context.next_rtg_decrement,
         acting_dropout=config.actor.acting_dropout,
@@ -192,7 +195,7 @@ class WindowPolicies:
     """π over windows.
 
     Attributes:
-      now: at the K steps, ``[B, K, A]``.
+      now: at the K steps, ``[B, K, A]``; at those of a burn-in, here and below, it means nothing.
       following: after them, ``[B, K, A]``.
       prediction: ``[B, K, H, O + 1]``, how normalized observations change in the next H steps,
         and the rewards; None if not predicted.
@@ -234,6 +237,7 @@ def window_policies(
         action: jax.Array,
         key: jax.Array,
         past: Seen | None = None,
+        skip: int = 0,
     ) -> ActorOutput:
         output: Any = parts.actor.apply(
             actor_params,
@@ -245,6 +249,7 @@ def window_policies(
             deterministic=False,
             rngs={"dropout": key},
             past=past,
+            skip=skip,
         )
         return output
 
@@ -256,15 +261,15 @@ def window_policies(
     )
     steps = window.action.shape[1]  # K
     at_steps = jax.tree.map(lambda x: x[:, :steps], everything)
-    now = look(actor_params, at_steps, window.action, now_key)
+    now = look(actor_params, at_steps, window.action, now_key, skip=parts.burn_in)
     following = window.following
     if following is None:
         last = jax.tree.map(lambda x: x[:, steps:], everything)  # [B, 1]
-        # It sees the whole window, whose mask goes with it; its own action is seen by nobody.
+        # It sees the whole window, whose mask and actions go with it; its own is seen by nobody.
         last = dataclasses.replace(last, mask=window.state_mask)
-        unknown = jnp.zeros_like(window.action[:, :1])
+        action = jnp.pad(window.action, ((0, 0), (0, 1), (0, 0)))  # [B, K+1, A]
         seen = jax.lax.stop_gradient(now.seen)
-        after = look(frozen, last, unknown, following_key, seen)
+        after = look(frozen, last, action, following_key, seen)
         next_gaussian, next_features = jax.tree.map(
             lambda a, b: jnp.concatenate([a[:, 1:], b], axis=1),
             (now.gaussian, now.features),
