@@ -357,6 +357,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
         "agent=sac",
     ),
     ({"tokens": "gsa", "context_length": 1}, "context_length=1"),
+    ({"tokens": "joint", "context_length": 1}, "context_length=1"),
+    ({"tokens": "joint", "window": "scattered", "prefill_env_steps": 100}, "tokens=gs"),
     ({"critic": "transformer", "context_length": 1}, "context_length=1"),
     ({"critic": "lstm"}, "critic='lstm'"),
     ({"critic_heads": 3, "critic": "transformer"}, "critic_width="),

@@ -20,6 +20,7 @@ from sacformer_jax.attention import acting_attention
 from sacformer_jax.cli import main
 from sacformer_jax.diagnostics import PANELS, _curve, attention_map, diagnostics_sheet
 from sacformer_jax.distributions import TanhGaussian
+from sacformer_jax.networks import STEP_TOKENS
 from sacformer_jax.pictures import TARGETS, mean_attention, returns_for_targets
 from sacformer_jax.recording import Recorder
 from sacformer_jax.train import make_training_env
@@ -87,8 +88,9 @@ def _episode(path: Path) -> tuple[Any, Any, Any, np.ndarray]:
     [
         {},
         {"tokens": "gsa", "acting_context": "episode", "acting_context_limit": 5},
+        {"tokens": "joint", "acting_context": "episode", "acting_context_limit": 5},
     ],
-    ids=["window", "episode"],
+    ids=["window", "episode", "joint"],
 )
 def test_attention_is_that_of_acting(fields: dict[str, Any], tmp_path: Path) -> None:
     policy, recording, contexts, taken = _episode(untrained_run(tmp_path / "run", **fields))
@@ -100,16 +102,16 @@ def test_attention_is_that_of_acting(fields: dict[str, Any], tmp_path: Path) -> 
     distribution = TanhGaussian(policy.spec.action_low, policy.spec.action_high)
     np.testing.assert_allclose(distribution.mode(mean)[:-1], taken, atol=1e-5)
 
-    pairs, tokens = (5, 3) if fields else (3, 2)
+    pairs, tokens = (5 if fields else 3), len(STEP_TOKENS[policy.config.context.tokens].names)
     assert attention.shape == (LAYERS, HEADS, steps, pairs, tokens)
     np.testing.assert_allclose(attention.sum(axis=(-1, -2)), 1.0, atol=1e-5)
     for step in range(pairs):  # nothing before the episode
         assert np.all(attention[:, :, step, : step + 1, :2] > 0)
         assert np.all(attention[:, :, step, step + 1 :] == 0)
-    if fields:
+    if tokens == 3:
         assert np.all(attention[:, :, :, 0, 2] == 0)  # its own action is not known yet
         assert np.all(attention[:, :, 5:, 1:, 2] > 0)
-    else:
+    if not fields:
         shown = mean_attention(policy)
         np.testing.assert_allclose(shown.attention, attention.mean(axis=2), atol=1e-6)
         assert not shown.older

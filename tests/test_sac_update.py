@@ -14,9 +14,11 @@ from gpt2 import gaussian_of
 from probe import point_config, point_env
 
 from sacformer_jax import agents
+from sacformer_jax.agents import sacformer
 from sacformer_jax.agents.sac_update import (
     bellman_target,
     lambda_target,
+    make_sac_agent,
     soft_update,
     step_weights,
 )
@@ -63,7 +65,7 @@ def make_window(seed=0, context_length=K) -> Window:
     )
 
 
-@pytest.fixture(scope="module", params=["gs", "gsa"])
+@pytest.fixture(scope="module", params=["gs", "gsa", "joint"])
 def setup(request):
     config = point_config(context_length=K, tokens=request.param)
     env = point_env(1)
@@ -437,6 +439,37 @@ def test_a_transformer_may_learn_from_its_prediction_alone():
     assert np.all(np.any(shown[:, 1] != other[:, 1], axis=-1) == window.state_mask[:, 0])
 
 
+def test_what_a_burn_in_is_not_computed_of_changes_nothing():
+    config = Config.from_preset(
+        "memory", context_length=3, learnt_steps=3, burn_in=2, tokens="joint", actor_layers=2,
+        actor_width=8, critic_width=16, state_path_width=16, acting_context_limit=3,
+        action_delay=1,
+    )  # fmt: skip
+    spec, window = point_env(1).spec, make_window(context_length=5)
+    learnt = (jnp.arange(5) >= 2)[None]
+    window = dataclasses.replace(
+        window, mask=window.mask & learnt, bootstrap_mask=window.bootstrap_mask & learnt
+    )
+    parts = sacformer.make_parts(config, spec, DataAxis())
+    learner = jax.jit(agents.make(config, spec).init)(jax.random.key(0))
+    kernel = learner.actor_params["params"]["prediction_out"]["kernel"]  # zeros
+    learner.actor_params["params"]["prediction_out"]["kernel"] = 0.1 + kernel
+
+    def updated(parts):
+        agent = make_sac_agent(parts)
+        hyper = hyperparameters(config, 1)
+        new, metrics = jax.jit(agent.update)(learner, hyper, window, jax.random.key(7))
+        return new.actor_opt.mu, new.critic_opt.mu, metrics
+
+    everything = dataclasses.replace(
+        parts,
+        burn_in=0,
+        critics=make_critics(config.critic, "float32", 3, spec.max_episode_steps + 1),
+    )
+    for some, every in zip(*map(jax.tree.leaves, map(updated, (parts, everything))), strict=True):
+        np.testing.assert_allclose(some, every, rtol=1e-3, atol=1e-6)
+
+
 def test_alpha_gradient_sign_and_first_adam_step(setup):
     _, _, update, learner, hyper = setup
     window = make_window()
@@ -723,9 +756,8 @@ def test_a_deterministic_policy_has_no_entropy():
 
 @pytest.mark.parametrize("conditioning", ["hindsight", "none"])
 def test_conditioning_decides_what_the_actor_is_shown(setup, conditioning):
-    _, spec, _, learner, hyper = setup
-    prefill = {"prefill_env_steps": 4 * 20}
-    config = point_config(context_length=K, return_conditioning=conditioning, **prefill)
+    config, spec, _, learner, hyper = setup
+    config = config.replace(return_conditioning=conditioning, prefill_env_steps=4 * 20)
     update = jax.jit(agents.make(config, spec).update)
     window, key = make_window(), jax.random.key(2)
 
