@@ -65,6 +65,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
         "tokens": "joint",
     },
+    # As many steps as SAC learns from.
+    "belief-joint-42": {
+        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
+        "tokens": "joint", "batch_size": 42,
+    },
     # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
     "belief-one-step-targets": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "td_lambda": 0.0,
