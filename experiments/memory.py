@@ -60,12 +60,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "belief-effect": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
     },
-    # A third of the tokens, which tell the same.
+    # A third of the tokens, at two thirds of the cost of an update.
     "belief-joint": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
         "tokens": "joint",
     },
-    # As many steps as SAC learns from.
+    # As many steps as SAC on windows learns from.
     "belief-joint-42": {
         **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
         "tokens": "joint", "batch_size": 42,

@@ -28,9 +28,9 @@ def cache_places(
 ) -> CachePlaces:
     """The places of an episode's tokens ``(G_0, S_0, [A_0,] G_1, …)`` in a ring.
 
-    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with tokens
-    behind the state, as that of the action, one more: A_{t-1} comes with step t and sees a step
-    that S_t no longer does.
+    Token number i lies at place i modulo C. The ring holds ``context_length`` steps; with a token
+    after the state, that of the action, one more: A_{t-1} comes with step t and sees a step that
+    S_t no longer does.
 
     Args:
       time_step: int32 ``[B]``, t of the newest state.
@@ -38,9 +38,9 @@ def cache_places(
       state_token: which of a step's tokens stands for the state, from 0.
       context_length: how many steps a token sees, its own included.
     """
-    n, behind = num_tokens, num_tokens - 1 - state_token
-    size = (context_length + behind) * n
-    new = time_step[:, None] * n + jnp.arange(-behind, n - behind)  # [B, n]
+    n, later = num_tokens, num_tokens - 1 - state_token
+    size = (context_length + (later > 0)) * n
+    new = time_step[:, None] * n + jnp.arange(-later, n - later)  # [B, n]
     newest = new[:, -1:]
     # The number of the token that lies at each place; below 0 it is none of this episode.
     held = newest - (newest - jnp.arange(size)) % size  # [B, C]

@@ -39,8 +39,8 @@ class StepTokens:
 
     Attributes:
       names: in order.
-      state: the place of the one whose features tell of the state; those behind it are seen from
-        the next step on.
+      state: the place of the one whose features tell of the state; those after it in the step are
+        seen from the next step on.
     """
 
     names: tuple[str, ...]
@@ -206,7 +206,7 @@ class TransformerActor(nn.Module):
           deterministic: dropout off; otherwise the rng ``dropout`` is used.
           past: what an earlier call left, about the P pairs before these.
           skip: of how many first states nothing is asked: they are only seen by those after them,
-            and zeros are returned for them.
+            and zeros are returned for them. 0 with a cache.
 
         Returns:
           mean and log-std ``[B, T, A]``; those of pairs that are not real mean nothing. With a
@@ -233,10 +233,12 @@ class TransformerActor(nn.Module):
                 by_state, zeros = path(newest), nn.initializers.zeros
                 output = by_state + Dense(by_state.shape[-1], zeros, name="from_trunk")(output)
         heads = GaussianHeads(self.action_size, self.head_init_scale, name="heads")
-        gaussian, features, prediction = jax.tree.map(
-            lambda x: jnp.pad(x, ((0, 0), (skip, 0), *((0, 0),) * (x.ndim - 2))),
-            (heads(output), features, prediction),
-        )
+        said = (heads(output), features, prediction)
+        if skip:
+            said = jax.tree.map(
+                lambda x: jnp.pad(x, ((0, 0), (skip, 0), *((0, 0),) * (x.ndim - 2))), said
+            )
+        gaussian, features, prediction = said
         return ActorOutput(gaussian, seen, features, prediction)
 
     def _step(
@@ -272,7 +274,7 @@ class TransformerActor(nn.Module):
         past: Seen | None,
         skip: int,
     ) -> tuple[jax.Array, Seen]:
-        """What the trunk makes of the state tokens but the first, ``[B, T - skip, D]``."""
+        """What the trunk makes of the state tokens after ``skip``, ``[B, T - skip, D]``."""
         n, states = len(step), time_step.shape[1]
         tokens = embed_steps(step, time_step, self.config.width, self.max_time_step)
 
@@ -292,15 +294,15 @@ class TransformerActor(nn.Module):
     ) -> tuple[jax.Array, Seen]:
         """The same of the newest state token alone, ``[B, 1, D]``, by way of the cache."""
         n, place = len(step), STEP_TOKENS[self.tokens].state
-        behind = n - 1 - place
-        # What is new since the last call: what lay behind the state then, and up to the state now.
-        num_steps = 2 if behind else 1
+        later = n - 1 - place
+        # What is new since the last call: what came after the state then, and up to the state now.
+        num_steps = 2 if later else 1
         step = {name: values[:, -num_steps:] for name, values in step.items()}
         steps = time_step[:, -num_steps:]
         tokens = embed_steps(step, steps, self.config.width, self.max_time_step)
         places = cache_places(time_step[:, -1], n, place, self.context_length)
         # (G, S, [A, G, S], A), ([G, S]) or ([J]).
-        new = slice((num_steps - 1) * n - behind, num_steps * n - behind)
+        new = slice((num_steps - 1) * n - later, num_steps * n - later)
         new_tokens = tokens[:, new]  # [B, n, D]
         time = jnp.repeat(steps, n, axis=1)[:, new]  # [B, n]
         trunk = Transformer(self.config, kept=(n - 1, n), name="trunk")
@@ -342,7 +344,9 @@ class MLP(nn.Module):
 
 
 class MLPActor(nn.Module):
-    """SAC's actor: sees the state alone. Same signature as :class:`TransformerActor`."""
+    """SAC's actor: sees the state alone, and skips none. Same signature as
+    :class:`TransformerActor`.
+    """
 
     widths: Sequence[int]
     activation: str

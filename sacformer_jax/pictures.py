@@ -30,6 +30,8 @@ TARGETS = (0.25, 0.5, 0.75, 1.0, 1.25)
 """Target returns that are tried, over that of training."""
 MAX_PAIRS = 50
 """Pairs that an attention map shows by themselves."""
+_TOKENS = {"return": "return-to-go"}
+"""Names of tokens in pictures, where they differ from the networks'."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,7 +184,8 @@ def draw_policy(policy: Policy, to: Path, episodes: int, seed: int, title: str) 
         achieved_returns(targets, returns, target, to / "target_return.png", title)
         yield to / "target_return.png"
     shown = mean_attention(policy, seed)
-    tokens = STEP_TOKENS[policy.config.context.tokens].names
+    names = STEP_TOKENS[policy.config.context.tokens].names
+    tokens = [_TOKENS.get(name, name) for name in names]
     attention_map(shown.attention, tokens, shown.older, to / "attention.png", title)
     yield to / "attention.png"
 

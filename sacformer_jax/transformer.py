@@ -23,7 +23,6 @@ from sacformer_jax.layers import (
 )
 
 ACTIVATIONS = {"relu": nn.relu, "gelu": nn.gelu, "tanh": nn.tanh, "silu": nn.silu}
-EVERY_TOKEN = (0, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,11 +147,12 @@ class Transformer(nn.Module):
 
     Attributes:
       config: sizes.
-      kept: ``(first, step)``: return only these tokens; the last block then computes only those.
+      kept: ``(first, step)``: return only these tokens; the last block then computes only those,
+        its queries by a layer of their own. None: every token, the last block like the others.
     """
 
     config: TransformerConfig
-    kept: tuple[int, int] = EVERY_TOKEN
+    kept: tuple[int, int] | None = None
 
     @nn.compact
     def __call__(
@@ -198,7 +198,7 @@ class Transformer(nn.Module):
     def _dropout_size(self, tokens: tuple[int, ...], keys: int) -> int:
         """Elements that dropout looks at: the embeddings, and three times in each block."""
         batch, queries = tokens
-        cfg, (first, step) = self.config, self.kept
+        cfg, (first, step) = self.config, self.kept or (0, 1)
         each = cfg.heads * keys + 2 * cfg.width  # of a query in a block
         last = len(range(first, queries, step))
         return batch * (queries * cfg.width + ((cfg.layers - 1) * queries + last) * each)

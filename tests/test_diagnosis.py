@@ -28,6 +28,7 @@ from diagnosis.numbers import (
     soft_returns,
     value_bias,
 )
+from diagnosis.picture import KINDS
 from diagnosis.subject import Subject, contexts_of, full_windows, make_tools, subjects
 from diagnosis.values import Episodes, judged, make_judge, make_sampler
 from PIL import Image
@@ -41,7 +42,7 @@ from sacformer_jax.checkpoint import CheckpointWriter, Progress, RunFolder
 from sacformer_jax.critics import Critics
 from sacformer_jax.envs import EnvSpec
 from sacformer_jax.members import seed_members
-from sacformer_jax.networks import GaussianParams
+from sacformer_jax.networks import STEP_TOKENS, GaussianParams
 from sacformer_jax.runner import sources_of, train
 from sacformer_jax.train import policy_of
 from sacformer_jax.types import Acted, Context, PolicyState, TrainState
@@ -421,6 +422,10 @@ SECTIONS = {
 
 def sections_of(row: dict[str, Any]) -> set[str]:
     return {name.split("/")[0] for name in row} - {"run", "member"}
+
+
+def test_every_kind_of_token_can_be_drawn() -> None:
+    assert set(KINDS) == {name for step in STEP_TOKENS.values() for name in step.names}
 
 
 def check_picture(path: Path) -> None:

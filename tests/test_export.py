@@ -23,6 +23,7 @@ STEPS, ENVS = 45, 3
 CASES: dict[str, dict[str, Any]] = {
     "window": {},
     "episode": {"acting_context": "episode", "tokens": "gsa"},
+    "joint": {"tokens": "joint"},
     "ppo": {"agent": "ppo"},
 }
 

@@ -18,7 +18,12 @@ from diagnosis.table import Runs
 _DPI = 200
 _PANELS = 4
 _DARK, _PALE = "0.15", "0.65"
-_KINDS = {"return": ("0.15", "-", "o"), "state": ("0.45", "--", "s"), "action": ("0.7", ":", "^")}
+KINDS = {
+    "return": ("0.15", "-", "o"),
+    "state": ("0.45", "--", "s"),
+    "action": ("0.7", ":", "^"),
+    "joint": ("0.15", "-", "o"),
+}
 _MOST_POINTS = 1_500
 _CAPTION = (
     "Gradients: signal-to-noise ratio of an update's gradient at the restored state, dark bars of "
@@ -97,7 +102,7 @@ def _draw_attention(axes: Axes, means: dict[str, float]) -> None:
     if not curves:
         return _say_nothing(axes, "sees one state")
     for kind, curve in curves.items():
-        color, dashes, marker = _KINDS[kind]
+        color, dashes, marker = KINDS[kind]
         heights = [float(np.mean(values)) for values in curve.values()]
         axes.plot(list(curve), heights, dashes, color=color, marker=marker, ms=3, label=kind)
     axes.set_ylim(bottom=0.0)
