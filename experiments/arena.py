@@ -8,9 +8,10 @@ python experiments/arena.py --arena delay --jobs 2     # actions two steps late,
 `best` both agents with preset `cpu` (SAC as published: single steps, one-step targets), and presets
 `paper` and `authors` at the sizes that make `cpu` fast, as variants.py has them, with the first
 three seeds. With preset `memory` SAC sees the last 6 observations with the actions between them,
-SACFormer the same as tokens, and neither of them a return-to-go. SAC's one-step targets are there,
+SACFormer the same in tokens, and neither of them a return-to-go. SAC's one-step targets are there,
 too: on the seeds that were tuned on they were ahead of λ-returns with velocities hidden, behind
-them with actions delayed.
+them with actions delayed. `sacformer-gsa` is what preset `memory` was when velocities were first
+hidden on these seeds.
 """
 
 from __future__ import annotations
@@ -41,12 +42,18 @@ MEMORY_VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"preset": "memory", "agent": "sac", "seeds": 5},
     "sac-one-step": {"preset": "cpu", **memory.VARIANTS["sac"], "seeds": 5},
 }
+HIDDEN_VARIANTS: dict[str, dict[str, Any]] = {
+    **MEMORY_VARIANTS,
+    "sacformer-gsa": {**MEMORY_VARIANTS["sacformer"], "tokens": "gsa", "batch_size": 32},
+}
 
 
 def study(arena: str) -> Study:
     """All its runs."""
     full = arena == FULL
     tasks, variants = (TASKS, VARIANTS) if full else (memory.TASKS, MEMORY_VARIANTS)
+    if arena == "hidden":
+        variants = HIDDEN_VARIANTS
     kept_from_the_agent = {} if full else memory.ARENAS[arena]
     configs = {
         f"{task}-{variant}": Config.from_preset(

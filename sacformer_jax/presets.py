@@ -193,10 +193,11 @@ _BEST = (
 _MEMORY = (
     *_BEST,
     Layer(
-        "preset memory: states and actions, and a transformer that learns to foretell "
+        "preset memory: a token a step, and a transformer that learns to foretell "
         "(experiments/README.md)",
         {
-            "tokens": "gsa",
+            "tokens": "joint",
+            "batch_size": 42,
             "return_conditioning": "none",
             "time_embedding": "rotary",
             "transformer_loss": "prediction",

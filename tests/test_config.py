@@ -204,10 +204,12 @@ def test_preset_memory_shows_both_agents_the_same_past() -> None:
     context = sacformer.context
     seen = (context.context_length, context.acting_context_limit, context.burn_in + 1)
     assert seen == (sac.task.stack_obs,) * 3
-    assert (context.tokens, context.return_conditioning) == ("gsa", "none")
+    assert (context.tokens, context.return_conditioning) == ("joint", "none")
+    for made in (sacformer, sac):  # as many steps to learn from
+        assert made.replay.batch_size * made.context.steps_to_learn == 252
     for made in (sacformer, sac):
         best = Config.from_preset("best", agent=made.agent, env="Hopper").flat()
-        for name in ("td_lambda", "total_env_steps", "batch_size", "state_path_width"):
+        for name in ("td_lambda", "total_env_steps", "state_path_width"):
             assert made.flat()[name] == best[name], name
 
 

@@ -248,7 +248,7 @@ def test_the_arena_is_fair_and_its_seeds_are_fresh(
 
 def test_preset_memory_is_what_was_tuned() -> None:
     tuned = importlib.import_module("memory").study("delay").configs
-    for agent, variant in {"sacformer": "belief-effect", "sac": "sac-lambda"}.items():
+    for agent, variant in {"sacformer": "belief-joint-42", "sac": "sac-lambda"}.items():
         preset = Config.from_preset("memory", env="Hopper", agent=agent, action_delay=2)
         other = tuned[f"Hopper-{variant}"].flat()
         differs = {name for name, value in preset.flat().items() if other[name] != value}
