@@ -181,9 +181,8 @@ def test_the_cache_holds_the_episode_and_no_more():
     assert jax.tree.leaves(agent.init_cache(5)) == []
 
 
-@pytest.mark.parametrize("tokens", ["gsa", "joint"])
-def test_a_policy_object_acts_on_its_whole_episode(tokens):
-    config = acting_config(tokens=tokens)
+def test_a_policy_object_acts_on_its_whole_episode():
+    config = acting_config(tokens="gsa")
     agent, spec, state = make_agent(config, 60)
     policy = Policy(config, spec, agent, state)
     rng = np.random.default_rng(1)

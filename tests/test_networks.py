@@ -91,7 +91,6 @@ def oracle(params, inputs, layers, heads, band, tokens="gs", rotary=False):
     [
         (3, 1, K, "gs", None, "absolute"),
         (2, 2, K, "gs", None, "none"),
-        (2, 4, K + 1, "gs", None, "absolute"),
         (3, 1, K + 1, "gsa", None, "absolute"),
         (1, 2, K, "gsa", (12, 10), "absolute"),
         (2, 2, K + 1, "gsa", None, "rotary"),

@@ -409,7 +409,7 @@ def _context_by_hand(
     return Context(*arrays, cache={})
 
 
-@pytest.mark.parametrize("tokens", ["gs", "gsa", "joint"])
+@pytest.mark.parametrize("tokens", ["gs", "joint"])
 def test_predict_equals_act_on_a_context_built_by_hand(policy: Policy, tokens: str) -> None:
     if tokens != "gs":
         config = policy.config.replace(tokens=tokens, head_init_scale=1.0)

@@ -65,7 +65,7 @@ def make_window(seed=0, context_length=K) -> Window:
     )
 
 
-@pytest.fixture(scope="module", params=["gs", "gsa", "joint"])
+@pytest.fixture(scope="module", params=["gs", "joint"])
 def setup(request):
     config = point_config(context_length=K, tokens=request.param)
     env = point_env(1)
