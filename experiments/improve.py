@@ -61,6 +61,14 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-predicting": {**_LAMBDA_PATH, **PREDICTED},
     "lambda-belief": {**_LAMBDA_PATH, **BELIEF},
     "lambda-belief-states": {**_LAMBDA_PATH, **BELIEF, **_STATES},
+    # As many steps to learn from as SAC, which is much where states do not tell all.
+    "lambda-path-42": {**_LAMBDA_PATH, "batch_size": 42},
+    # Preset `memory`, where nothing is hidden.
+    "lambda-belief-joint-42": {
+        **_LAMBDA_PATH, **BELIEF, "return_conditioning": "none", "time_embedding": "rotary",
+        "tokens": "joint", "batch_size": 42, "burn_in": K - 1, "acting_context": "episode",
+        "acting_context_limit": K,
+    },
 }  # fmt: skip
 # 42 windows of 6 for 256 single steps.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
@@ -76,8 +84,8 @@ SAC: dict[str, dict[str, Any]] = {
     "sac-lambda-norm": {**_WINDOWS, "td_lambda": 0.5, "critic_layer_norm": True},
 }
 FURTHER = (
-    "sacformer", "lambda-path", "larger-path-no-time", "lambda-belief-states", "sac", "sac-lambda",
-    "sac-lambda-larger",
+    "sacformer", "lambda-path", "larger-path-no-time", "lambda-belief-states", "lambda-path-42",
+    "lambda-belief-joint-42", "sac", "sac-lambda", "sac-lambda-larger",
 )  # fmt: skip
 """Variants that are trained on all four tasks."""
 
