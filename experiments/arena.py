@@ -46,20 +46,19 @@ HIDDEN_VARIANTS: dict[str, dict[str, Any]] = {
     **MEMORY_VARIANTS,
     "sacformer-gsa": {**MEMORY_VARIANTS["sacformer"], "tokens": "gsa", "batch_size": 32},
 }
+VARIANTS_OF = {FULL: VARIANTS, "hidden": HIDDEN_VARIANTS, "delay": MEMORY_VARIANTS}
 
 
 def study(arena: str) -> Study:
     """All its runs."""
     full = arena == FULL
-    tasks, variants = (TASKS, VARIANTS) if full else (memory.TASKS, MEMORY_VARIANTS)
-    if arena == "hidden":
-        variants = HIDDEN_VARIANTS
+    tasks = TASKS if full else memory.TASKS
     kept_from_the_agent = {} if full else memory.ARENAS[arena]
     configs = {
         f"{task}-{variant}": Config.from_preset(
             **settings, env=task, total_env_steps=ENV_STEPS, seed=FIRST_SEED, **kept_from_the_agent
         )
-        for (variant, settings), task in itertools.product(variants.items(), tasks)
+        for (variant, settings), task in itertools.product(VARIANTS_OF[arena].items(), tasks)
     }
     return Study("arena" if full else f"arena-{arena}", configs, __file__)
 

@@ -24,6 +24,13 @@ FURTHER_TASKS = ("HalfCheetah", "Ant")
 ENV_STEPS, SEEDS = 60_000, 3
 K = 6
 """Of preset `cpu`."""
+# Every step is learnt from with all the past that acting shows; what the upper blocks have heard of
+# is kept in acting, as training shows it.
+WHOLE_PAST: dict[str, Any] = {
+    "burn_in": K - 1,
+    "acting_context": "episode",
+    "acting_context_limit": K,
+}
 SACFORMER: dict[str, dict[str, Any]] = {
     "sacformer": {},
     "no-return": {"return_conditioning": "none"},
@@ -37,8 +44,7 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "predicting": {"prediction_weight": 1.0},
     "predicting-features": {"critic_features": True, "prediction_weight": 1.0},
     "short-windows": {"context_length": 3, "batch_size": 64},
-    # What the upper blocks have heard of is kept in acting, as training shows it.
-    "burn-in": {"burn_in": K - 1, "acting_context": "episode", "acting_context_limit": K},
+    "burn-in": WHOLE_PAST,
 }
 _LAMBDA_PATH: dict[str, Any] = {"td_lambda": 0.5, "state_path_width": 256}
 _LARGER_PATH: dict[str, Any] = {**_LAMBDA_PATH, "td_lambda": 0.8}
@@ -66,8 +72,7 @@ TOGETHER: dict[str, dict[str, Any]] = {
     # Preset `memory`, where nothing is hidden.
     "lambda-belief-joint-42": {
         **_LAMBDA_PATH, **BELIEF, "return_conditioning": "none", "time_embedding": "rotary",
-        "tokens": "joint", "batch_size": 42, "burn_in": K - 1, "acting_context": "episode",
-        "acting_context_limit": K,
+        "tokens": "joint", "batch_size": 42, **WHOLE_PAST,
     },
 }  # fmt: skip
 # 42 windows of 6 for 256 single steps.

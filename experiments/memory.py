@@ -16,29 +16,23 @@ import itertools
 import sys
 from typing import Any
 
-from improve import BELIEF, PREDICTED
+from improve import BELIEF, PREDICTED, WHOLE_PAST, K
 from study import Study, main_of_choices
 
 from sacformer_jax import Config
 
 TASKS = ("Hopper", "Walker2d", "HalfCheetah")
 ENV_STEPS, SEEDS = 60_000, 3
-K = 6
-"""Of preset `cpu`."""
 ARENAS: dict[str, dict[str, Any]] = {
     "hidden": {"hide_velocities": True},
     "delay": {"action_delay": 2},
 }
 _SEQUENCE: dict[str, Any] = {"tokens": "gsa", "return_conditioning": "none"}
-# Every step is learnt from with all the past that acting shows.
-_WHOLE_PAST: dict[str, Any] = {
-    "burn_in": K - 1,
-    "acting_context": "episode",
-    "acting_context_limit": K,
-}
 _LAMBDA_SEQUENCE: dict[str, Any] = {
-    **_SEQUENCE, **_WHOLE_PAST, "td_lambda": 0.5, "time_embedding": "rotary",
+    **_SEQUENCE, **WHOLE_PAST, "td_lambda": 0.5, "time_embedding": "rotary",
 }  # fmt: skip
+_BELIEF_SEQUENCE: dict[str, Any] = {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256}
+_JOINT: dict[str, Any] = {**_BELIEF_SEQUENCE, "prediction_steps": "effect", "tokens": "joint"}
 _LAMBDA_SAC: dict[str, Any] = {
     "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
 }  # fmt: skip
@@ -51,29 +45,19 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "blind-critic": _SEQUENCE,
     "critic-features": {**_SEQUENCE, "critic_features": True},
     "predicting-features": {**_SEQUENCE, **PREDICTED},
-    "critic-history": {**_SEQUENCE, **_WHOLE_PAST, "critic_history": K},
+    "critic-history": {**_SEQUENCE, **WHOLE_PAST, "critic_history": K},
     "lambda-history": {**_LAMBDA_SEQUENCE, "critic_history": K},
     "lambda-predicting": {**_LAMBDA_SEQUENCE, **PREDICTED},
     "lambda-predicting-path": {**_LAMBDA_SEQUENCE, **PREDICTED, "state_path_width": 256},
-    "belief": {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256},
+    "belief": _BELIEF_SEQUENCE,
     # Of a delayed action what it will meet is foretold, too.
-    "belief-effect": {
-        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
-    },
+    "belief-effect": {**_BELIEF_SEQUENCE, "prediction_steps": "effect"},
     # A third of the tokens, at two thirds of the cost of an update.
-    "belief-joint": {
-        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
-        "tokens": "joint",
-    },
+    "belief-joint": _JOINT,
     # As many steps as SAC on windows learns from.
-    "belief-joint-42": {
-        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "prediction_steps": "effect",
-        "tokens": "joint", "batch_size": 42,
-    },
+    "belief-joint-42": {**_JOINT, "batch_size": 42},
     # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
-    "belief-one-step-targets": {
-        **_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256, "td_lambda": 0.0,
-    },
+    "belief-one-step-targets": {**_BELIEF_SEQUENCE, "td_lambda": 0.0},
     "belief-stacked": {
         **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
         "batch_size": 256, "stack_obs": K, "state_path_width": 256,
