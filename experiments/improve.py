@@ -53,6 +53,11 @@ _STATES: dict[str, Any] = {**_NO_TIME, "return_conditioning": "none"}
 PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
 # The transformer learns from predicting alone; actor and critics see what it makes of the past.
 BELIEF: dict[str, Any] = {**PREDICTED, "transformer_loss": "prediction"}
+# … with the actions before, one token a step; with 42 windows it is preset `memory`.
+JOINT_BELIEF: dict[str, Any] = {
+    **_LAMBDA_PATH, **BELIEF, **WHOLE_PAST,
+    "tokens": "joint", "return_conditioning": "none", "time_embedding": "rotary",
+}  # fmt: skip
 TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
     "lambda-path": _LAMBDA_PATH,
@@ -69,11 +74,8 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-belief-states": {**_LAMBDA_PATH, **BELIEF, **_STATES},
     # As many steps to learn from as SAC, which is much where states do not tell all.
     "lambda-path-42": {**_LAMBDA_PATH, "batch_size": 42},
-    # Preset `memory`, where nothing is hidden.
-    "lambda-belief-joint-42": {
-        **_LAMBDA_PATH, **BELIEF, "return_conditioning": "none", "time_embedding": "rotary",
-        "tokens": "joint", "batch_size": 42, **WHOLE_PAST,
-    },
+    "lambda-belief-joint-42": {**JOINT_BELIEF, "batch_size": 42},
+    "lambda-belief-joint-42-ahead": {**JOINT_BELIEF, "batch_size": 42, "prediction_steps": 3},
 }  # fmt: skip
 # 42 windows of 6 for 256 single steps.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
@@ -90,7 +92,8 @@ SAC: dict[str, dict[str, Any]] = {
 }
 FURTHER = (
     "sacformer", "lambda-path", "larger-path-no-time", "lambda-belief-states", "lambda-path-42",
-    "lambda-belief-joint-42", "sac", "sac-lambda", "sac-lambda-larger",
+    "lambda-belief-joint-42", "lambda-belief-joint-42-ahead", "sac", "sac-lambda",
+    "sac-lambda-larger",
 )  # fmt: skip
 """Variants that are trained on all four tasks."""
 

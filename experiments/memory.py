@@ -16,7 +16,7 @@ import itertools
 import sys
 from typing import Any
 
-from improve import BELIEF, PREDICTED, WHOLE_PAST, K
+from improve import BELIEF, JOINT_BELIEF, PREDICTED, WHOLE_PAST, K
 from study import Study, main_of_choices
 
 from sacformer_jax import Config
@@ -32,7 +32,7 @@ _LAMBDA_SEQUENCE: dict[str, Any] = {
     **_SEQUENCE, **WHOLE_PAST, "td_lambda": 0.5, "time_embedding": "rotary",
 }  # fmt: skip
 _BELIEF_SEQUENCE: dict[str, Any] = {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256}
-_JOINT: dict[str, Any] = {**_BELIEF_SEQUENCE, "prediction_steps": "effect", "tokens": "joint"}
+_JOINT: dict[str, Any] = {**JOINT_BELIEF, "prediction_steps": "effect"}
 _LAMBDA_SAC: dict[str, Any] = {
     "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
 }  # fmt: skip
