@@ -74,8 +74,6 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-belief-states": {**_LAMBDA_PATH, **BELIEF, **_STATES},
     # As many steps to learn from as SAC, which is much where states do not tell all.
     "lambda-path-42": {**_LAMBDA_PATH, "batch_size": 42},
-    # … of one token a step instead of two, which is less to compute than 32 windows of two.
-    "lambda-path-joint-42": {**_LAMBDA_PATH, "batch_size": 42, "tokens": "joint"},
     "lambda-belief-joint-42": {**JOINT_BELIEF, "batch_size": 42},
     "lambda-belief-joint-42-ahead": {**JOINT_BELIEF, "batch_size": 42, "prediction_steps": 3},
 }  # fmt: skip
@@ -94,8 +92,8 @@ SAC: dict[str, dict[str, Any]] = {
 }
 FURTHER = (
     "sacformer", "lambda-path", "larger-path-no-time", "lambda-belief-states", "lambda-path-42",
-    "lambda-path-joint-42", "lambda-belief-joint-42", "lambda-belief-joint-42-ahead",
-    "sac", "sac-lambda", "sac-lambda-larger",
+    "lambda-belief-joint-42", "lambda-belief-joint-42-ahead", "sac", "sac-lambda",
+    "sac-lambda-larger",
 )  # fmt: skip
 """Variants that are trained on all four tasks."""
 
