@@ -51,8 +51,9 @@ class Study:
 
     Args:
       name: of the study.
-      configs: every run's name, ``[TASK-]VARIANT[-SEED]``, and configuration, whose ``seeds`` are
-        trained together; ``run_dir`` is set here.
+      configs: every run's name, ``[TASK-]VARIANT``, and configuration, whose ``seeds`` are trained
+        together; ``run_dir`` is set here. Seeds that a variant gets in another run belong to it
+        where that run's name ends in ``-from-SEED``.
       script: the file that makes the study; it is started again as the worker of each run.
       runs: where run folders lie; default ``runs/NAME`` below the working directory.
       results: where table and picture go; default ``results`` beside the script.

@@ -185,7 +185,8 @@ def test_equal_runs_and_runs_that_diverged() -> None:
 def test_a_runs_name_without_task_and_seed_is_its_variant() -> None:
     row = {"env": "Hopper", "seed": "1"}
     names = {"Hopper-sac-1": "sac", "Hopper-td3": "td3", "Hopper-K=1": "K=1",
-             "64-windows-1": "64-windows", "Ant-sac-1": "Ant-sac"}  # fmt: skip
+             "64-windows-1": "64-windows", "Ant-sac-1": "Ant-sac",
+             "Hopper-sac-from-0": "sac"}  # fmt: skip
     assert {name: scores.variant_of({**row, "run": name}) for name in names} == names
 
 

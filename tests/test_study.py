@@ -246,6 +246,17 @@ def test_the_arena_is_fair_and_its_seeds_are_fresh(
         assert not tuned & set(own.all_seeds)
 
 
+def test_seeds_added_to_the_arena_are_as_the_first_five_but_others() -> None:
+    configs = importlib.import_module("arena").study("full").configs
+    more = {name: config for name, config in configs.items() if "-from-" in name}
+    assert len(more) == 5 * 2
+    for name, config in more.items():
+        first = configs[name.removesuffix("-from-105")]
+        assert config.all_seeds == (105, 106, 107, 108, 109)
+        assert first.all_seeds == (100, 101, 102, 103, 104)
+        assert config.replace(seed=100, run_dir=first.run.run_dir) == first
+
+
 def test_preset_memory_is_what_was_tuned() -> None:
     tuned = importlib.import_module("memory").study("delay").configs
     for agent, variant in {"sacformer": "belief-joint-42", "sac": "sac-lambda"}.items():

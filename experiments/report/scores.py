@@ -8,6 +8,7 @@ Everywhere below, ``by_task`` is a sequence with an array for each task, whose l
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -58,12 +59,14 @@ class Estimate:
 
 
 def variant_of(row: Mapping[str, Any]) -> str:
-    """What a run stands for: its name without task and seed.
+    """What a run stands for: its name without task and seeds.
 
-    Older tables have a run for each seed, with the seed at the end of its name. So a variant's own
-    name must not end in ``-NUMBER``.
+    Seeds that were added to a variant are a run of its own, whose name ends in ``-from-SEED``, the
+    first of them. Older tables have a run for each seed, with the seed at the end of its name. So
+    a variant's own name must end in neither.
     """
-    return str(row["run"]).removeprefix(f"{row['env']}-").removesuffix(f"-{row['seed']}")
+    name = str(row["run"]).removeprefix(f"{row['env']}-").removesuffix(f"-{row['seed']}")
+    return re.sub(r"-from-\d+$", "", name)
 
 
 def run_scores(returns: Array) -> Array:
