@@ -190,7 +190,8 @@ def test_every_study_can_be_trained_as_it_is(name: str, scale: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments"), [("improve", ()), ("memory", ("hidden",)), ("memory", ("delay",))]
+    ("name", "arguments"),
+    [("improve", ()), ("improve", ("100k",)), ("memory", ("hidden",)), ("memory", ("delay",))],
 )
 def test_the_agents_are_compared_on_the_same_task(name: str, arguments: tuple[str, ...]) -> None:
     """In studies of what makes SACFormer better: the same steps, updates, seeds, evaluations."""
