@@ -52,34 +52,34 @@ SACFORMER: dict[str, dict[str, Any]] = {
     "short-windows": {"context_length": 3, "batch_size": 64},
     "burn-in": WHOLE_PAST,
 }
-_LAMBDA_PATH: dict[str, Any] = {"td_lambda": 0.5, "state_path_width": 256}
-_LARGER_PATH: dict[str, Any] = {**_LAMBDA_PATH, "td_lambda": 0.8}
+LAMBDA_PATH: dict[str, Any] = {"td_lambda": 0.5, "state_path_width": 256}
+_LARGER_PATH: dict[str, Any] = {**LAMBDA_PATH, "td_lambda": 0.8}
 _NO_TIME: dict[str, Any] = {"time_embedding": "none"}
 _STATES: dict[str, Any] = {**_NO_TIME, "return_conditioning": "none"}
 PREDICTED: dict[str, Any] = {"critic_features": True, "prediction_weight": 1.0}
 # The transformer learns from predicting alone; actor and critics see what it makes of the past.
 BELIEF: dict[str, Any] = {**PREDICTED, "transformer_loss": "prediction"}
-# … with the actions before, one token a step; with 42 windows it is preset `memory`.
+# … with the actions before, one token a step; with 42 windows it is preset `best`.
 JOINT_BELIEF: dict[str, Any] = {
-    **_LAMBDA_PATH, **BELIEF, **WHOLE_PAST,
+    **LAMBDA_PATH, **BELIEF, **WHOLE_PAST,
     "tokens": "joint", "return_conditioning": "none", "time_embedding": "rotary",
 }  # fmt: skip
 TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
-    "lambda-path": _LAMBDA_PATH,
-    "lambda-path-norm": {**_LAMBDA_PATH, "critic_layer_norm": True},
+    "lambda-path": LAMBDA_PATH,
+    "lambda-path-norm": {**LAMBDA_PATH, "critic_layer_norm": True},
     "lambda-no-time": {"td_lambda": 0.5, **_NO_TIME},
-    "lambda-path-no-time": {**_LAMBDA_PATH, **_NO_TIME},
-    "lambda-path-states": {**_LAMBDA_PATH, **_STATES},
+    "lambda-path-no-time": {**LAMBDA_PATH, **_NO_TIME},
+    "lambda-path-states": {**LAMBDA_PATH, **_STATES},
     # What else SAC has otherwise: wide heads at first, and as many steps to learn from.
-    "lambda-path-as-sac": {**_LAMBDA_PATH, **_STATES, "head_init_scale": 1.0, "batch_size": 42},
+    "lambda-path-as-sac": {**LAMBDA_PATH, **_STATES, "head_init_scale": 1.0, "batch_size": 42},
     "larger-path": _LARGER_PATH,
     "larger-path-no-time": {**_LARGER_PATH, **_NO_TIME},
-    "lambda-path-predicting": {**_LAMBDA_PATH, **PREDICTED},
-    "lambda-belief": {**_LAMBDA_PATH, **BELIEF},
-    "lambda-belief-states": {**_LAMBDA_PATH, **BELIEF, **_STATES},
+    "lambda-path-predicting": {**LAMBDA_PATH, **PREDICTED},
+    "lambda-belief": {**LAMBDA_PATH, **BELIEF},
+    "lambda-belief-states": {**LAMBDA_PATH, **BELIEF, **_STATES},
     # As many steps to learn from as SAC, which is much where states do not tell all.
-    "lambda-path-42": {**_LAMBDA_PATH, "batch_size": 42},
+    "lambda-path-42": {**LAMBDA_PATH, "batch_size": 42},
     "lambda-belief-joint-42": {**JOINT_BELIEF, "batch_size": 42},
     "lambda-belief-joint-42-ahead": {**JOINT_BELIEF, "batch_size": 42, "prediction_steps": 3},
 }  # fmt: skip
