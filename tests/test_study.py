@@ -18,6 +18,7 @@ import study as studies
 from study_table import read_table, summary
 
 from sacformer_jax import Config
+from sacformer_jax.agents.sacformer import predicted_steps
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.envs import EnvSpec
@@ -256,6 +257,20 @@ def test_seeds_added_to_the_arena_are_as_the_first_five_but_others() -> None:
         assert config.all_seeds == (105, 106, 107, 108, 109)
         assert first.all_seeds == (100, 101, 102, 103, 104)
         assert config.replace(seed=100, run_dir=first.run.run_dir) == first
+
+
+def test_preset_best_is_what_was_tuned() -> None:
+    tuned = importlib.import_module("improve").study("100k").configs
+    for agent, variant in {"sacformer": "lambda-belief-joint-42", "sac": "sac-lambda"}.items():
+        preset, other = (
+            Config.from_preset("best", env="Hopper", agent=agent),
+            tuned[f"Hopper-{variant}"],
+        )
+        # "effect" is a step where an action comes into effect at once.
+        assert predicted_steps(preset) == predicted_steps(other)
+        flat, as_tuned = preset.flat(), other.flat()
+        differs = {name for name in flat if as_tuned[name] != flat[name]}
+        assert differs - {"prediction_steps"} == {"preset", "seeds", "run_dir"}
 
 
 def test_preset_memory_is_what_was_tuned() -> None:
