@@ -106,6 +106,7 @@ LONGER = (
     "lambda-path", "lambda-path-42", "lambda-belief-joint-42", "lambda-belief-joint-42-ahead",
     "sac-lambda",
 )  # fmt: skip
+"""Variants that go on to 100,000 steps."""
 
 
 def study(steps: str = "60k") -> Study:
@@ -115,12 +116,13 @@ def study(steps: str = "60k") -> Study:
     variants |= {name: {"agent": "sac", **changes} for name, changes in SAC.items()}
     longer = steps != "60k"
     tasks = (*TASKS, "HalfCheetah") if longer else (*TASKS, *FURTHER_TASKS)
+    on_all_tasks = LONGER if longer else FURTHER
     configs = {
         f"{task}-{variant}": Config.from_preset(
             "cpu", env=task, seeds=SEEDS, total_env_steps=ENV_STEPS[steps], **changes
         )
         for (variant, changes), task in itertools.product(variants.items(), tasks)
-        if variant in LONGER or (not longer and (task in TASKS or variant in FURTHER))
+        if variant in on_all_tasks or (task in TASKS and not longer)
     }
     return Study(f"improve-{steps}" if longer else "improve", configs, __file__)
 

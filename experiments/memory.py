@@ -16,7 +16,7 @@ import itertools
 import sys
 from typing import Any
 
-from improve import BELIEF, JOINT_BELIEF, PREDICTED, WHOLE_PAST, K
+from improve import BELIEF, JOINT_BELIEF, PREDICTED, SAC, WHOLE_PAST, K
 from study import Study, main_of_choices
 
 from sacformer_jax import Config
@@ -31,11 +31,9 @@ _SEQUENCE: dict[str, Any] = {"tokens": "gsa", "return_conditioning": "none"}
 _LAMBDA_SEQUENCE: dict[str, Any] = {
     **_SEQUENCE, **WHOLE_PAST, "td_lambda": 0.5, "time_embedding": "rotary",
 }  # fmt: skip
-_BELIEF_SEQUENCE: dict[str, Any] = {**_LAMBDA_SEQUENCE, **BELIEF, "state_path_width": 256}
+_BELIEF_SEQUENCE: dict[str, Any] = {**JOINT_BELIEF, "tokens": "gsa"}
 _JOINT: dict[str, Any] = {**JOINT_BELIEF, "prediction_steps": "effect"}
-_LAMBDA_SAC: dict[str, Any] = {
-    "agent": "sac", "learnt_steps": K, "batch_size": 42, "td_lambda": 0.5,
-}  # fmt: skip
+_LAMBDA_SAC: dict[str, Any] = {"agent": "sac", **SAC["sac-lambda"]}
 VARIANTS: dict[str, dict[str, Any]] = {
     "sac": {"agent": "sac", "stack_obs": K},
     "sac-lambda": {**_LAMBDA_SAC, "stack_obs": K},
