@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
+import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -197,20 +198,52 @@ def _attend_backward(residuals: Residuals, grad: jax.Array) -> tuple[jax.Array |
 attend.defvjp(_attend_forward, _attend_backward)
 
 
-def rotated(x: jax.Array, time: jax.Array) -> jax.Array:
-    """Turns pairs of numbers of each head by angles that grow with the token's time (RoFormer, Su
-    et al., arXiv 2104.09864): the product of a query and a key then depends on the difference of
-    their times alone. Entry i is paired with entry i + E/2.
+@flax.struct.dataclass
+class Rotation:
+    """By which angles tokens are turned: their cosines and sines, ``[B, 1, T, E/2]``."""
+
+    cos: jax.Array
+    sin: jax.Array
+
+    @classmethod
+    def at(cls, time: jax.Array, size: int) -> Rotation:
+        """Angles that grow with the token's time, of E/2 wavelengths from 2π on.
+
+        Args:
+          time: ``[B, T]``.
+          size: E, of a head.
+        """
+        half = size // 2
+        frequency = _ROTARY_BASE ** (-jnp.arange(half) / half)
+
+        def both(time: jax.Array) -> tuple[jax.Array, jax.Array]:
+            angle = time[..., None] * frequency  # [..., E/2]
+            return jnp.cos(angle), jnp.sin(angle)
+
+        def one_by_one(time: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.tree.map(lambda x: x.swapaxes(0, 1), jax.lax.map(both, time.T))
+
+        # On CPUs XLA would compute them again, for each head, wherever queries or keys are turned
+        # or turned back: a ninth of an update's time. What leaves a loop it cannot compute again.
+        cos, sin = jax.lax.platform_dependent(time, cpu=one_by_one, default=both)  # [B, T, E/2]
+        return cls(cos[:, None], sin[:, None])
+
+    def of(self, tokens: slice) -> Rotation:
+        """That of some of the tokens."""
+        return jax.tree.map(lambda x: x[:, :, tokens], self)
+
+
+def rotated(x: jax.Array, rotation: Rotation) -> jax.Array:
+    """Turns pairs of numbers of each head (RoFormer, Su et al., arXiv 2104.09864): the product of a
+    query and a key then depends on the difference of their times alone. Entry i is paired with
+    entry i + E/2.
 
     Args:
       x: queries or keys, ``[B, H, T, E]``, E even.
-      time: ``[B, T]``.
+      rotation: of their T tokens.
     """
-    half = x.shape[-1] // 2
-    frequency = _ROTARY_BASE ** (-jnp.arange(half) / half)
-    angle = time[:, None, :, None] * frequency  # [B, 1, T, E/2]
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
     a, b = jnp.split(x.astype(jnp.float32), 2, axis=-1)
+    cos, sin = rotation.cos, rotation.sin
     return jnp.concatenate([a * cos - b * sin, a * sin + b * cos], axis=-1).astype(x.dtype)
 
 

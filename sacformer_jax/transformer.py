@@ -17,6 +17,7 @@ from sacformer_jax.layers import (
     Dense,
     Dropout,
     LayerNorm,
+    Rotation,
     attend,
     attention_weights,
     rotated,
@@ -87,7 +88,7 @@ class Block(nn.Module):
         dropout: Dropout,
         positions: jax.Array | None = None,
         past: KeysValues | None = None,
-        time: jax.Array | None = None,
+        rotation: Rotation | None = None,
     ) -> tuple[jax.Array, KeysValues]:
         """``x [B, T, D]`` -> ``[B, S, D]`` and its keys and values; see :class:`Transformer`."""
         cfg = self.config
@@ -111,9 +112,8 @@ class Block(nn.Module):
             return y.reshape(batch, -1, cfg.heads, head_width).swapaxes(1, 2)  # [B, H, ., D/H]
 
         q, k, v = split_heads(q), split_heads(k), split_heads(v)
-        if cfg.rotary:
-            assert time is not None
-            q, k = rotated(q, time[:, kept]), rotated(k, time)
+        if rotation is not None:
+            q, k = rotated(q, rotation.of(kept)), rotated(k, rotation)
         seen = KeysValues(k, v)
         if positions is not None:
             seen = KeysValues(
@@ -185,13 +185,17 @@ class Transformer(nn.Module):
         if not deterministic and cfg.dropout > 0.0:
             size = self._dropout_size(x.shape[:2], mask.shape[-1])
             dropout = Dropout(self.make_rng("dropout"), cfg.dropout, size)
+        rotation = None
+        if cfg.rotary:
+            assert time is not None
+            rotation = Rotation.at(time, cfg.width // cfg.heads)
         x = dropout(x)
         seen = []
         for i in range(cfg.layers):
             kept = self.kept if i == cfg.layers - 1 else None
             before = None if past is None else past[i]
             block = Block(cfg, kept, name=f"block_{i}")
-            x, block_seen = block(x, mask, dropout, positions, before, time)
+            x, block_seen = block(x, mask, dropout, positions, before, rotation)
             seen.append(block_seen)
         return LayerNorm(name="ln_f")(x), tuple(seen)
 
