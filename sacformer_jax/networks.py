@@ -312,7 +312,8 @@ class TransformerActor(nn.Module):
 def _action_before(action: jax.Array, state_mask: jax.Array) -> jax.Array:
     """The action that led to each state, ``[B, T, A]``; zero where none is known."""
     known = jnp.where(state_mask[:, :-1, None], action[:, :-1], 0.0)
-    return jnp.pad(known, ((0, 0), (1, 0), (0, 0)))
+    # Not by padding, which does not convert to ONNX for any number of environments.
+    return jnp.concatenate([jnp.zeros_like(action[:, :1]), known], axis=1)
 
 
 class MLP(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -106,6 +107,22 @@ def test_an_update_does_no_more_than_its_products():
     costs: Any = lowered.compile().cost_analysis()
     expected = products_of_an_update(config, program.env.spec)
     assert expected < costs["flops"] < 1.1 * expected
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="reads the CPU's HLO")
+def test_rotary_angles_are_computed_once():
+    """In a loop over the window's steps, not wherever queries and keys are turned."""
+    batch, steps, width = 32, 7, 16
+    config = point_config(
+        num_envs=1, time_embedding="rotary", context_length=steps, batch_size=batch
+    )
+    assert (config.actor.actor_width, config.actor.actor_heads) == (width, 1)
+    program, key = make_program(config, point_env(1)), jax.random.key(0)
+    state = jax.eval_shape(program.init, key)
+    update = jax.jit(program.update).lower(state.buffer, state.hyper, state.learner, key)
+    shapes = re.findall(r"= f32\[([\d,]+)\]\S* sine\(", update.compile().as_text())
+    sizes = [math.prod(map(int, shape.split(","))) for shape in shapes]
+    assert sizes and max(sizes) == batch * width // 2
 
 
 def test_memory_of_the_replay_is_that_of_its_steps():

@@ -23,7 +23,7 @@ STEPS, ENVS = 45, 3
 CASES: dict[str, dict[str, Any]] = {
     "window": {},
     "episode": {"acting_context": "episode", "tokens": "gsa"},
-    "joint": {"tokens": "joint"},
+    "joint": {"tokens": "joint", "time_embedding": "rotary"},
     "ppo": {"agent": "ppo"},
 }
 
@@ -225,7 +225,7 @@ def test_the_command(
     assert "is there already" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("case", ["window", "episode", "ppo", "td3"])
+@pytest.mark.parametrize("case", ["window", "episode", "joint", "ppo", "td3"])
 def test_onnxruntime_acts_like_the_policy(
     policies: dict[str, Policy], tmp_path: Path, case: str
 ) -> None:
