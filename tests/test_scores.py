@@ -186,7 +186,7 @@ def test_a_runs_name_without_task_and_seed_is_its_variant() -> None:
     row = {"env": "Hopper", "seed": "1"}
     names = {"Hopper-sac-1": "sac", "Hopper-td3": "td3", "Hopper-K=1": "K=1",
              "64-windows-1": "64-windows", "Ant-sac-1": "Ant-sac",
-             "Hopper-sac-from-0": "sac"}  # fmt: skip
+             "Hopper-sac-from-0": "sac", "Hopper-td3-from-1": "td3"}  # fmt: skip
     assert {name: scores.variant_of({**row, "run": name}) for name in names} == names
 
 

@@ -65,8 +65,9 @@ def variant_of(row: Mapping[str, Any]) -> str:
     first of them. Older tables have a run for each seed, with the seed at the end of its name. So
     a variant's own name must end in neither.
     """
-    name = str(row["run"]).removeprefix(f"{row['env']}-").removesuffix(f"-{row['seed']}")
-    return re.sub(r"-from-\d+$", "", name)
+    name = str(row["run"]).removeprefix(f"{row['env']}-")
+    variant, added = re.subn(r"-from-\d+$", "", name)
+    return variant if added else name.removesuffix(f"-{row['seed']}")
 
 
 def run_scores(returns: Array) -> Array:
