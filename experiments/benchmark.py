@@ -20,6 +20,7 @@ from pathlib import Path
 import jax
 from bench import checkpointing, compiling, environments, peers, scaling, training, update
 from bench.clock import Clock
+from machine import cpu_model
 
 from sacformer_jax.cores import usable_cores
 
@@ -52,7 +53,7 @@ def machine() -> Results:
     """What it runs on, and how busy that was."""
     names = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "gymnasium", "brax", "numpy")
     found: Results = {
-        "machine.cpu": _cpu_model(),
+        "machine.cpu": cpu_model(),
         "machine.cores": usable_cores(),
         "machine.cores_of_all": os.cpu_count() or 0,
         "machine.devices": str(jax.devices()),
@@ -65,13 +66,6 @@ def machine() -> Results:
     if hasattr(os, "getloadavg"):
         found["machine.load_average_at_start"] = os.getloadavg()[0]
     return found
-
-
-def _cpu_model() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 def run(parts: Mapping[str, Measure], results: Results, path: Path | None) -> bool:

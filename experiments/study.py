@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import figures
+from machine import cpu_model
 from study_rows import rows_of
 from study_table import Row, read_table, summary, write_table
 
@@ -196,7 +197,7 @@ class Study:
         if cores:
             os.sched_setaffinity(0, cores)  # before JAX makes its threads
         config, folder = self.configs[name], self._folder(name)
-        self._note_commit(name)
+        self._note_origin(name)
         if folder.latest_step() is None:
             result = train(config)
         else:
@@ -205,28 +206,29 @@ class Study:
 
     # --- results -----------------------------------------------------------------------------
 
-    def _commits_path(self, name: str) -> Path:
-        return self.runs / f"{name}.commits"
-
-    def _note_commit(self, name: str) -> None:
-        """Keeps by which versions of the code a run was trained."""
+    def _note_origin(self, name: str) -> None:
+        """Keeps by which versions of the code a run was trained, and on which processors."""
         described = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--exclude=*"],
             cwd=self.script.parent, capture_output=True, text=True, check=False,
         )  # fmt: skip
-        commit = described.stdout.strip() or "unknown"
-        path = self._commits_path(name)
-        commits = path.read_text().split() if path.exists() else []
-        if self._folder(name).latest_step() is None:
-            commits = []
-        if commit not in commits:
-            path.write_text("\n".join([*commits, commit]) + "\n")
+        begins = self._folder(name).latest_step() is None
+        for what, value in (("commits", described.stdout.strip()), ("cpus", cpu_model())):
+            noted, value = [] if begins else self._noted(name, what), value or "unknown"
+            if value not in noted:
+                self._notes(name, what).write_text("\n".join([*noted, value]) + "\n")
+
+    def _notes(self, name: str, what: str) -> Path:
+        return self.runs / f"{name}.{what}"
+
+    def _noted(self, name: str, what: str) -> list[str]:
+        path = self._notes(name, what)
+        return path.read_text().splitlines() if path.exists() else []
 
     def rows(self, name: str) -> list[Row]:
         """A run's evaluations as rows of the table; none if it has not begun."""
-        path = self._commits_path(name)
-        commits = path.read_text().split() if path.exists() else []
-        return rows_of(self.name, name, self._folder(name), commits)
+        commits, cpus = self._noted(name, "commits"), self._noted(name, "cpus")
+        return rows_of(self.name, name, self._folder(name), commits, cpus)
 
     def write(self, names: Iterable[str]) -> None:
         """Puts the rows of these runs into the table and draws it; other runs' rows stay."""

@@ -10,7 +10,9 @@ from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.logging import read_records
 
 
-def rows_of(study: str, run: str, folder: RunFolder, commits: Sequence[str]) -> list[Row]:
+def rows_of(
+    study: str, run: str, folder: RunFolder, commits: Sequence[str], cpus: Sequence[str]
+) -> list[Row]:
     """The evaluations in a run's folder, seed by seed; none if it has not begun.
 
     Args:
@@ -18,6 +20,7 @@ def rows_of(study: str, run: str, folder: RunFolder, commits: Sequence[str]) -> 
       run: name of the run.
       folder: of the run.
       commits: by which versions of the code it was trained.
+      cpus: on which models of processors.
     """
     if not folder.timings_path.exists():
         return []
@@ -42,6 +45,7 @@ def rows_of(study: str, run: str, folder: RunFolder, commits: Sequence[str]) -> 
             "episodes": record["episodes"],
             "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
             "commit": "+".join(commits) or "unknown",
+            "cpu": "+".join(cpus) or "unknown",
         }
         for member in file.members
         for record in read_records(folder.metrics_path(member.name), "eval")

@@ -16,7 +16,7 @@ from report.scores import run_scores
 
 COLUMNS = (
     "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
-    "return_std", "episodes", "wall_s", "commit",
+    "return_std", "episodes", "wall_s", "commit", "cpu",
 )  # fmt: skip
 
 Row = dict[str, Any]

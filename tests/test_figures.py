@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from report.curves import grid_figure, panels_figure
 from report.intervals import intervals_figure
-from report.lines import StudyLines, read_study
+from report.lines import Program, StudyLines, read_study
 from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS, normalized
 from report.styles import AGENTS, Style, styles_of
 from report.tables import aggregates, markdown
@@ -27,7 +27,7 @@ from report.timed import scores_until, step_seconds, timed
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 COLUMNS = (
     "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
-    "return_std", "episodes", "wall_s", "commit",
+    "return_std", "episodes", "wall_s", "commit", "cpu",
 )  # fmt: skip
 Runs = Mapping[str, Sequence[Sequence[float]]]
 
@@ -38,21 +38,23 @@ def write(
     agent: str | None = None,
     every: int = 1_000,
     seconds: Mapping[str, float] | None = None,
+    cpus: Mapping[str, str] | None = None,
 ) -> Path:
     """A table of ``{TASK-VARIANT: [returns of seed 0, of seed 1, …]}``.
 
-    ``seconds`` are a run's from one evaluation to the next.
+    ``seconds`` are a run's from one evaluation to the next, ``cpus`` what it was trained on.
     """
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for run, seeds in runs.items():
             task, variant = run.split("-", 1)
-            for seed, returns in enumerate(seeds):
+            variant, _, first_seed = variant.partition("-from-")
+            for seed, returns in enumerate(seeds, int(first_seed or 0)):
                 for place, value in enumerate(returns, 1):
                     at = (seconds or {}).get(run, 0.5) * (place - 1)
                     row = (path.stem, run, agent or variant, "cpu", task, "native", seed,
-                           every * place, value, 1.0, 4, at, "abc")  # fmt: skip
+                           every * place, value, 1.0, 4, at, "abc", (cpus or {}).get(run, "A"))  # fmt: skip
                     writer.writerow(row)
     return path
 
@@ -231,13 +233,32 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
 
 def test_a_run_that_was_held_up_is_no_slower(tmp_path: Path) -> None:
     study = read(tmp_path / "arena.csv", {"Hopper-sac": [[0.0, 1, 2, 3, 4]] * 2})
-    line = study.lines["Hopper", "sac"]
-    assert step_seconds(line) == pytest.approx(0.5 / 1_000)
+    line, program = study.lines["Hopper", "sac"], Program("A", 2)
+    assert step_seconds(line, program) == pytest.approx(0.5 / 1_000)
     for of_seed in line.seconds.values():
         of_seed.update({step: at + 60.0 for step, at in of_seed.items() if step > 3_000})
-    assert step_seconds(line) == pytest.approx(0.5 / 1_000)
+    assert step_seconds(line, program) == pytest.approx(0.5 / 1_000)
     line.seconds = {0: {1_000: 0.0}}
-    assert math.isnan(step_seconds(line))
+    assert math.isnan(step_seconds(line, program))
+
+
+def test_seconds_are_compared_on_the_same_processor(tmp_path: Path) -> None:
+    flat = [returns_for("Hopper", *[0.5] * 8)] * 2
+    runs = {"Hopper-sacformer": flat, "Hopper-sac": flat}
+    seconds = {"Hopper-sacformer": 2.0, "Hopper-sac": 1.0, "Hopper-sac-from-2": 0.5}
+    cpus = {"Hopper-sacformer": "B", "Hopper-sac": "A", "Hopper-sac-from-2": "B"}
+    assert timed(read(tmp_path / "a.csv", runs, seconds=seconds, cpus=cpus), "sac") == []
+    runs["Hopper-sac-from-2"] = flat
+    study = read(tmp_path / "b.csv", runs, seconds=seconds, cpus=cpus)
+    assert study.lines["Hopper", "sac"].programs == dict(
+        zip(range(4), [*2 * [Program("A", 2)], *2 * [Program("B", 2)]], strict=True)
+    )
+    (one,) = timed(study, "sac")
+    assert one.slowdown == pytest.approx(4.0)
+    # Of both, the geometric mean.
+    both = runs | {"Hopper-sacformer-from-2": flat}
+    (one,) = timed(read(tmp_path / "c.csv", both, seconds=seconds, cpus=cpus), "sac")
+    assert one.slowdown == pytest.approx(math.sqrt(4.0 * 0.5))
 
 
 def test_the_table_of_scores(tmp_path: Path) -> None:

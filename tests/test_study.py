@@ -65,6 +65,7 @@ def _pretend(study: studies.Study, name: str, *returns: list[float], commits: st
         for step in steps:
             timings.write(json.dumps({"env_steps": step, "chunk_seconds": 1.5}) + "\n")
     (study.runs / f"{name}.commits").write_text(commits)
+    (study.runs / f"{name}.cpus").write_text("A CPU\n")
 
 
 def _study(folder: Path, script: str = "raise SystemExit(5)") -> studies.Study:
@@ -89,7 +90,7 @@ def test_the_table_holds_every_evaluation(tmp_path: Path) -> None:
     ]
     same = {"study": "tiny", "run": "Hopper-b", "agent": "sac", "env": "Hopper",
             "engine": "native", "preset": "cpu", "return_std": "0.5", "episodes": "2",
-            "commit": "abc+def-dirty"}  # fmt: skip
+            "commit": "abc+def-dirty", "cpu": "A CPU"}  # fmt: skip
     assert all(row.items() >= same.items() for row in rows)
     assert (tmp_path / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
 

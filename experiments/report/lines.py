@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import re
+from collections import Counter
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +31,19 @@ def label_of(variant: str) -> str:
     return LABELS.get(variant, variant)
 
 
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What a seed was trained in, on which its seconds depend.
+
+    Attributes:
+      cpu: model of the processor.
+      num_seeds: how many there were in it.
+    """
+
+    cpu: str
+    num_seeds: int
+
+
 @dataclasses.dataclass
 class Line:
     """A variant on a task.
@@ -40,6 +54,7 @@ class Line:
       agent: the algorithm.
       curves: for each seed, the evaluation return by env steps.
       seconds: for each seed, those trained until an evaluation, by env steps; NaN if unknown.
+      programs: for each seed, what it was trained in.
     """
 
     task: str
@@ -47,6 +62,7 @@ class Line:
     agent: str
     curves: dict[int, dict[int, float]] = dataclasses.field(default_factory=dict)
     seconds: dict[int, dict[int, float]] = dataclasses.field(default_factory=dict)
+    programs: dict[int, Program] = dataclasses.field(default_factory=dict)
 
     @property
     def seeds(self) -> list[int]:
@@ -136,12 +152,15 @@ def read_study(path: Path) -> StudyLines | None:
     """The lines of ``results/STUDY.csv``; None if it has no rows."""
     rows = read_table(path)
     lines: dict[tuple[str, str], Line] = {}
+    num_seeds = Counter(run for run, _ in {(row["run"], row["seed"]) for row in rows})
     for row in rows:
         task, variant = row["env"], variant_of(row)
         line = lines.setdefault((task, variant), Line(task, variant, row["agent"]))
-        curve = line.curves.setdefault(int(row["seed"]), {})
+        seed = int(row["seed"])
+        curve = line.curves.setdefault(seed, {})
         curve[row["env_steps"]] = row["return_mean"]
-        seconds = line.seconds.setdefault(int(row["seed"]), {})
+        line.programs[seed] = Program(row.get("cpu") or "unknown", num_seeds[row["run"]])
+        seconds = line.seconds.setdefault(seed, {})
         seconds[row["env_steps"]] = float(row.get("wall_s") or "nan")
     if not lines:
         return None

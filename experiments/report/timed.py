@@ -2,18 +2,20 @@
 
 Seconds are those of training, all seeds of a run together, without compilation and evaluations:
 they say something where runs had the same share of the same machine, as in the studies named here.
-An env step takes a run's median over the stretches between its evaluations, all of them the same
-work: a run that was held up for a while is no slower for it.
+So they are compared among runs of as many seeds on the same model of processor alone. An env step
+takes the median over the stretches between evaluations, all of them the same work: a run that was
+held up for a while is no slower for it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from report.lines import Line, StudyLines
+from report.lines import Line, Program, StudyLines
 from report.scores import (
     Estimate,
     can_normalize,
@@ -36,7 +38,7 @@ class Timed:
       slowdown: its seconds over the baseline's for the same env steps, geometric mean over tasks.
       difference: of the interquartile mean of normalized scores, less the baseline's.
       improvement: probability of, over the baseline.
-      tasks: those that both have finished, with as many seeds and a scale.
+      tasks: those that both have finished and that have a scale, where times can be compared.
     """
 
     variant: str
@@ -55,30 +57,43 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
             if variant == baseline or not (can_normalize(task) and study.finished(task, baseline)):
                 continue
             own, base = study.lines[task, variant], study.lines[task, baseline]
-            # All seeds of a run are one program: of other numbers of seeds, times say nothing.
-            if len(own.seeds) != len(base.seeds):
+            slowdown = _slowdown(own, base)
+            if slowdown is None:
                 continue
-            slowdown = step_seconds(own) / step_seconds(base)
             tasks.append(task)
             slowdowns.append(slowdown)
             of.append(normalized(task, scores_until(own, _steps_for(base, slowdown))))
             over.append(normalized(task, base.scores))
         if tasks:
-            mean_slowdown = float(np.exp(np.mean(np.log(slowdowns))))
             difference = iqm_difference(of, over)
             improvement = probability_of_improvement(of, over)
-            made.append(Timed(variant, mean_slowdown, difference, improvement, tasks))
+            made.append(Timed(variant, _mean_ratio(slowdowns), difference, improvement, tasks))
     return made
 
 
-def step_seconds(line: Line) -> float:
-    """What an env step of all seeds takes a line; NaN with fewer than two evaluations."""
+def step_seconds(line: Line, program: Program) -> float:
+    """What an env step of all seeds takes a line in such a program; NaN with fewer than two
+    evaluations.
+    """
     of_stretches: list[float] = []
-    for of_seed in line.seconds.values():
-        steps = np.array(sorted(of_seed), float)
+    for seed, of_seed in line.seconds.items():
+        steps = np.array(sorted(of_seed), float) if line.programs[seed] == program else np.empty(0)
         if steps.size > 1:
             of_stretches.extend(np.diff([of_seed[int(step)] for step in steps]) / np.diff(steps))
     return float(np.median(of_stretches)) if of_stretches else math.nan
+
+
+def _slowdown(own: Line, base: Line) -> float | None:
+    """Seconds of a line over those of another, mean over the programs they share; None without."""
+    shared = sorted({*own.programs.values()} & {*base.programs.values()}, key=repr)
+    if not shared:
+        return None
+    return _mean_ratio([step_seconds(own, each) / step_seconds(base, each) for each in shared])
+
+
+def _mean_ratio(ratios: Sequence[float]) -> float:
+    """Their geometric mean."""
+    return float(np.exp(np.mean(np.log(ratios))))
 
 
 def scores_until(line: Line, limit: float) -> np.ndarray:
