@@ -122,7 +122,8 @@ def test_rotary_angles_are_computed_once():
     update = jax.jit(program.update).lower(state.buffer, state.hyper, state.learner, key)
     shapes = re.findall(r"= f32\[([\d,]+)\]\S* sine\(", update.compile().as_text())
     sizes = [math.prod(map(int, shape.split(","))) for shape in shapes]
-    assert sizes and max(sizes) == batch * width // 2
+    assert sizes
+    assert max(sizes) == batch * width // 2
 
 
 def test_memory_of_the_replay_is_that_of_its_steps():

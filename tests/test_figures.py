@@ -53,8 +53,9 @@ def write(
             for seed, returns in enumerate(seeds, int(first_seed or 0)):
                 for place, value in enumerate(returns, 1):
                     at = (seconds or {}).get(run, 0.5) * (place - 1)
+                    cpu = (cpus or {}).get(run, "A")
                     row = (path.stem, run, agent or variant, "cpu", task, "native", seed,
-                           every * place, value, 1.0, 4, at, "abc", (cpus or {}).get(run, "A"))  # fmt: skip
+                           every * place, value, 1.0, 4, at, "abc", cpu)  # fmt: skip
                     writer.writerow(row)
     return path
 
