@@ -82,6 +82,11 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-42": {**LAMBDA_PATH, "batch_size": 42},
     "lambda-belief-joint-42": {**JOINT_BELIEF, "batch_size": 42},
     "lambda-belief-joint-42-ahead": {**JOINT_BELIEF, "batch_size": 42, "prediction_steps": 3},
+    # Whether it needs the past: a transformer of one state is an MLP that foretells.
+    "lambda-belief-one-state": {
+        **LAMBDA_PATH, **BELIEF, **_STATES,
+        "context_length": 1, "learnt_steps": K, "batch_size": 42,
+    },
 }  # fmt: skip
 # 42 windows of 6 for 256 single steps.
 _WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
@@ -104,7 +109,7 @@ FURTHER = (
 """Variants that are trained on all four tasks."""
 LONGER = (
     "lambda-path", "lambda-path-42", "lambda-belief-joint-42", "lambda-belief-joint-42-ahead",
-    "sac-lambda",
+    "lambda-belief-one-state", "sac-lambda",
 )  # fmt: skip
 """Variants that go on to 100,000 steps."""
 
