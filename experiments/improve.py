@@ -12,7 +12,8 @@ and what is ahead over all four is put together.
 Hopper and Walker2d are learnt about where these runs end, so the variants that could be preset
 `best` (`LONGER`) go on to the arena's 100,000 steps. The rule, written down before: SACFormer's
 `best` stays `lambda-path` unless another's interquartile mean over the three tasks is ahead of its
-own by 0.05 there. (A copy of a run of 60,000 steps under runs/improve-100k is resumed.)
+own by 0.05 there. (A copy of a run of 60,000 steps under runs/improve-100k, with what lies beside
+it, is resumed.)
 """
 
 from __future__ import annotations

@@ -5,10 +5,16 @@ from __future__ import annotations
 import platform
 from pathlib import Path
 
+UNKNOWN = "unknown"
+
 
 def cpu_model() -> str:
-    """The processor's name; empty where none is known."""
+    """The processor: its name and, as virtual machines give many the same, its model in numbers
+    (family/model/stepping).
+    """
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
+    facts = {name.strip(): value.strip() for name, _, value in (x.partition(":") for x in lines)}
+    name = facts.get("model name") or platform.processor() or UNKNOWN
+    numbers = [facts[key] for key in ("cpu family", "model", "stepping") if key in facts]
+    return f"{name} {'/'.join(numbers)}".strip()

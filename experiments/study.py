@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import figures
-from machine import cpu_model
+from machine import UNKNOWN, cpu_model
 from study_rows import rows_of
 from study_table import Row, read_table, summary, write_table
 
@@ -213,8 +213,9 @@ class Study:
             cwd=self.script.parent, capture_output=True, text=True, check=False,
         )  # fmt: skip
         begins = self._folder(name).latest_step() is None
-        for what, value in (("commits", described.stdout.strip()), ("cpus", cpu_model())):
-            noted, value = [] if begins else self._noted(name, what), value or "unknown"
+        commit = described.stdout.strip() or UNKNOWN
+        for what, value in (("commits", commit), ("cpus", cpu_model())):
+            noted = [] if begins else self._noted(name, what) or [UNKNOWN]
             if value not in noted:
                 self._notes(name, what).write_text("\n".join([*noted, value]) + "\n")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from study_table import Row
+from machine import UNKNOWN
+from study_table import MORE, Row
 
 from sacformer_jax.checkpoint import RunFolder
 from sacformer_jax.logging import read_records
@@ -44,8 +45,8 @@ def rows_of(
             "return_std": round(record["return_std"], 2),
             "episodes": record["episodes"],
             "wall_s": round(seconds.get(record["env_steps"], 0.0), 1),
-            "commit": "+".join(commits) or "unknown",
-            "cpu": "+".join(cpus) or "unknown",
+            "commit": MORE.join(commits) or UNKNOWN,
+            "cpu": MORE.join(cpus) or UNKNOWN,
         }
         for member in file.members
         for record in read_records(folder.metrics_path(member.name), "eval")

@@ -19,6 +19,9 @@ COLUMNS = (
     "return_std", "episodes", "wall_s", "commit", "cpu",
 )  # fmt: skip
 
+MORE = "+"
+"""Between the commits, or processors, of a run that was resumed by, or on, another."""
+
 Row = dict[str, Any]
 
 

@@ -249,6 +249,9 @@ def test_seconds_are_compared_on_the_same_processor(tmp_path: Path) -> None:
     seconds = {"Hopper-sacformer": 2.0, "Hopper-sac": 1.0, "Hopper-sac-from-2": 0.5}
     cpus = {"Hopper-sacformer": "B", "Hopper-sac": "A", "Hopper-sac-from-2": "B"}
     assert timed(read(tmp_path / "a.csv", runs, seconds=seconds, cpus=cpus), "sac") == []
+    for cpu in ("unknown", "A+B"):  # which seconds were whose?
+        alike = dict.fromkeys(runs, cpu)
+        assert timed(read(tmp_path / "a.csv", runs, seconds=seconds, cpus=alike), "sac") == []
     runs["Hopper-sac-from-2"] = flat
     study = read(tmp_path / "b.csv", runs, seconds=seconds, cpus=cpus)
     assert study.lines["Hopper", "sac"].programs == dict(
@@ -256,10 +259,15 @@ def test_seconds_are_compared_on_the_same_processor(tmp_path: Path) -> None:
     )
     (one,) = timed(study, "sac")
     assert one.slowdown == pytest.approx(4.0)
-    # Of both, the geometric mean.
+    # Of both, the geometric mean; of those that have any.
     both = runs | {"Hopper-sacformer-from-2": flat}
-    (one,) = timed(read(tmp_path / "c.csv", both, seconds=seconds, cpus=cpus), "sac")
+    cpus["Hopper-sacformer-from-2"] = "A"
+    study = read(tmp_path / "c.csv", both, seconds=seconds, cpus=cpus)
+    (one,) = timed(study, "sac")
     assert one.slowdown == pytest.approx(math.sqrt(4.0 * 0.5))
+    study.lines["Hopper", "sac"].seconds |= {0: {1_000: 0.0}, 1: {1_000: 0.0}}
+    (one,) = timed(study, "sac")
+    assert one.slowdown == pytest.approx(4.0)
 
 
 def test_the_table_of_scores(tmp_path: Path) -> None:

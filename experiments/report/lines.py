@@ -14,7 +14,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from study_table import read_table
+from machine import UNKNOWN
+from study_table import MORE, read_table
 
 from report.scores import REFERENCE_RETURNS, run_scores, variant_of
 
@@ -22,7 +23,7 @@ FINISHED_SHARE = 0.95
 """A line that ends before this share of the study's longest is in progress. Evaluations of
 different agents do not end at the very same step."""
 LABELS = {"sacformer": "SACFormer", "sac": "SAC", "td3": "TD3", "ddpg": "DDPG", "ppo": "PPO"}
-_BASELINES = ("sac", "sacformer", "cpu", "K=10")
+_BASELINES = ("sac", "sac-lambda", "sacformer", "cpu", "K=10")
 _NEEDED = {"run", "agent", "env", "engine", "seed", "env_steps", "return_mean", "episodes"}
 
 
@@ -36,12 +37,17 @@ class Program:
     """What a seed was trained in, on which its seconds depend.
 
     Attributes:
-      cpu: model of the processor.
+      cpu: the processor, or all that a resumed run had.
       num_seeds: how many there were in it.
     """
 
     cpu: str
     num_seeds: int
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known which seconds are whose."""
+        return self.cpu != UNKNOWN and MORE not in self.cpu
 
 
 @dataclasses.dataclass
@@ -159,7 +165,7 @@ def read_study(path: Path) -> StudyLines | None:
         seed = int(row["seed"])
         curve = line.curves.setdefault(seed, {})
         curve[row["env_steps"]] = row["return_mean"]
-        line.programs[seed] = Program(row.get("cpu") or "unknown", num_seeds[row["run"]])
+        line.programs[seed] = Program(row.get("cpu") or UNKNOWN, num_seeds[row["run"]])
         seconds = line.seconds.setdefault(seed, {})
         seconds[row["env_steps"]] = float(row.get("wall_s") or "nan")
     if not lines:
@@ -173,7 +179,7 @@ def read_study(path: Path) -> StudyLines | None:
         variants=_ordered(list(dict.fromkeys(variant for _, variant in lines))),
         episodes=sorted({int(row["episodes"]) for row in rows}),
         engines=sorted({row["engine"] for row in rows}),
-        presets=sorted({row.get("preset") or "unknown" for row in rows}),
+        presets=sorted({row.get("preset") or UNKNOWN for row in rows}),
     )
 
 

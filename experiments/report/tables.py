@@ -159,7 +159,8 @@ def markdown(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str
         parts += [
             "## At equal wall-clock",
             "The same two, with every run stopped after the seconds of training in which "
-            f"{label_of(baseline)} makes all its env steps on the task.",
+            f"{label_of(baseline)} makes all its env steps on the task. Of the tasks where both "
+            "have runs of as many seeds on the same model of processor.",
             _timed_table(study, baseline),
         ]
     if study.name in COMPARED_WITH_PUBLISHED:
@@ -263,6 +264,8 @@ def _timed_table(study: StudyLines, baseline: str) -> str:
     rows = []
     for one in timed(study, baseline):
         rows.append([label_of(one.variant), f"{one.slowdown:.2f}", *_compared(study, one)])
+    if not rows:
+        return "Nothing to compare yet."
     name = label_of(baseline)
     head = ["", f"seconds, {name}'s = 1", f"interquartile mean less {name}'s"]
     return _table([*head, f"P(better than {name})"], rows)

@@ -2,7 +2,8 @@
 
 Seconds are those of training, all seeds of a run together, without compilation and evaluations:
 they say something where runs had the same share of the same machine, as in the studies named here.
-So they are compared among runs of as many seeds on the same model of processor alone. An env step
+So they are compared among runs of as many seeds on the same model of processor alone (which need
+not be the same machine, nor a machine with nothing else to do). An env step
 takes the median over the stretches between evaluations, all of them the same work: a run that was
 held up for a while is no slower for it.
 """
@@ -25,7 +26,7 @@ from report.scores import (
     run_scores,
 )
 
-TIMED = {"arena", "arena-hidden", "arena-delay"}
+TIMED = {"arena", "arena-hidden", "arena-delay", "improve-100k"}
 """Studies whose runs had a core each."""
 
 
@@ -86,9 +87,9 @@ def step_seconds(line: Line, program: Program) -> float:
 def _slowdown(own: Line, base: Line) -> float | None:
     """Seconds of a line over those of another, mean over the programs they share; None without."""
     shared = sorted({*own.programs.values()} & {*base.programs.values()}, key=repr)
-    if not shared:
-        return None
-    return _mean_ratio([step_seconds(own, each) / step_seconds(base, each) for each in shared])
+    ratios = [step_seconds(own, each) / step_seconds(base, each) for each in shared if each.known]
+    finite = [ratio for ratio in ratios if math.isfinite(ratio)]
+    return _mean_ratio(finite) if finite else None
 
 
 def _mean_ratio(ratios: Sequence[float]) -> float:
