@@ -12,8 +12,9 @@ and what is ahead over all four is put together.
 Hopper and Walker2d are learnt about where these runs end, so the variants that could be preset
 `best` (`LONGER`) go on to the arena's 100,000 steps. The rule, written down before: SACFormer's
 `best` stays `lambda-path` unless another's interquartile mean over the three tasks is ahead of its
-own by 0.05 there. (A copy of a run of 60,000 steps under runs/improve-100k, with what lies beside
-it, is resumed.)
+own by 0.05 there; the same of SAC's `sac-lambda`, written down later, before `sac-lambda-larger`
+was trained that far. (A copy of a run of 60,000 steps under runs/improve-100k, with what lies
+beside it, is resumed.)
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ FURTHER = (
 """Variants that are trained on all four tasks."""
 LONGER = (
     "lambda-path", "lambda-path-42", "lambda-belief-joint-42", "lambda-belief-joint-42-ahead",
-    "lambda-belief-one-state", "sac-lambda",
+    "lambda-belief-one-state", "sac-lambda", "sac-lambda-larger",
 )  # fmt: skip
 """Variants that go on to 100,000 steps."""
 

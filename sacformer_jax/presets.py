@@ -118,7 +118,7 @@ _AUTHORS_PREFILL = tuple(
 _CPU = (
     *_TARGET_RETURNS,
     Layer(
-        "preset cpu: learns most per minute on 2 cores (experiments/README.md)",
+        "preset cpu: small enough to learn in minutes on 2 cores (experiments/README.md)",
         {
             "total_env_steps": 60_000,
             "prefill_env_steps": 4_000,
@@ -172,7 +172,7 @@ _CPU = (
     ),
 )
 
-# What came out ahead on the seeds that were tuned on, for either agent (experiments/README.md).
+# What was chosen on the seeds that were tuned on, for either agent (experiments/README.md).
 _BEST = (
     *_CPU,
     Layer("preset best: 100,000 env steps", {"total_env_steps": 100_000}),
