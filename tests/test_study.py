@@ -95,6 +95,22 @@ def test_the_table_holds_every_evaluation(tmp_path: Path) -> None:
     assert (tmp_path / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_where_a_run_was_trained_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study, latest = _study(tmp_path), None
+    study.runs.mkdir()
+    monkeypatch.setattr(RunFolder, "latest_step", lambda folder: latest)
+    for cpu in ("A", "B"):  # it had no checkpoint, and begins anew
+        monkeypatch.setattr(studies, "cpu_model", lambda cpu=cpu: cpu)
+        study._note_origin("Hopper-a")
+    _pretend(study, "Hopper-b", [1.0], [2.0])
+    (study.runs / "Hopper-b.cpus").unlink()  # begun before they were noted, or elsewhere
+    latest = 100
+    study._note_origin("Hopper-b")
+    study._note_origin("Hopper-b")
+    assert (study.runs / "Hopper-a.cpus").read_text() == "B\n"
+    assert {row["cpu"] for row in study.rows("Hopper-b")} == {"unknown+B"}
+
+
 def test_rows_of_runs_not_asked_for_stay(tmp_path: Path) -> None:
     study = _study(tmp_path)
     _pretend(study, "Hopper-b", [1.0, 2.0], [3.0, 4.0])
