@@ -57,10 +57,11 @@ def test_interquartile_mean_by_hand() -> None:
 
 @pytest.mark.parametrize("num", range(1, 14))
 def test_interquartile_mean_of_any_number_of_runs(num: int) -> None:
-    values = np.random.default_rng(num).normal(size=(5, num))
-    split = num // 3
-    found = scores.interquartile_mean([values[:, :split], values[:, split:]])
+    values = np.random.default_rng(num).normal(size=(5, 2 * num))
+    found = scores.interquartile_mean([values[:, :num], values[:, num:]])
     np.testing.assert_allclose(found, [brute_iqm(row) for row in values])
+    found = scores.interquartile_mean([values[:, :num]])
+    np.testing.assert_allclose(found, [brute_iqm(row) for row in values[:, :num]])
 
 
 def test_the_interval_of_two_runs_on_two_tasks() -> None:
@@ -71,18 +72,18 @@ def test_the_interval_of_two_runs_on_two_tasks() -> None:
 
 
 def test_the_interval_is_the_quantiles_of_all_resamples() -> None:
-    tasks = [np.array([0.0, 1, 2, 2, 0]), np.array([2.0, 3, 1])]  # of unequal numbers of seeds
+    tasks = [np.array([0.0, 0, 1, 2]), np.array([1.0, 3])]  # of two seeds each counts twice
     draws = itertools.product(
-        itertools.product(tasks[0], repeat=5), itertools.product(tasks[1], repeat=3)
+        itertools.product(tasks[0], repeat=4), itertools.product(tasks[1], repeat=2)
     )
-    everything = np.sort([brute_iqm(np.array([*a, *b])) for a, b in draws])
+    everything = np.sort([brute_iqm(np.array([*a, *b, *b])) for a, b in draws])
     # Where quantiles lie within atoms, so that no random number matters.
     for end in (0.025, 0.975):
         assert len(set(np.quantile(everything, [end - 0.008, end + 0.008]))) == 1
     estimate = iqm_estimate(tasks)
-    assert estimate.value == brute_iqm(np.concatenate(tasks)) == 1.5
+    assert estimate.value == brute_iqm(np.array([0.0, 0, 1, 2, 1, 3, 1, 3])) == 1.25
     assert estimate.low == np.quantile(everything, 0.025) == 0.5
-    assert estimate.high == np.quantile(everything, 0.975) == 2.0
+    assert estimate.high == np.quantile(everything, 0.975) == 2.5
 
 
 def test_runs_are_resampled_within_their_task_only() -> None:
@@ -173,6 +174,17 @@ def test_single_seeds_have_no_interval() -> None:
     curve = iqm_estimate([np.array([[1.0], [2.0]])])
     assert curve.value.tolist() == [1, 2]
     assert np.isnan(curve.low).tolist() == np.isnan(curve.high).tolist() == [True, True]
+
+
+def test_a_task_with_more_runs_counts_no_more() -> None:
+    four, two = np.array([0.0, 1.0, 2.0, 3.0]), np.array([10.0, 20.0])
+    # Two runs count twice: of 0, 1, 2, 3, 10, 10, 20, 20 the middle four.
+    assert scores.interquartile_mean([four, two]) == pytest.approx((2 + 3 + 10 + 10) / 4)
+    assert mean_estimate([four, two]).value == pytest.approx((1.5 + 15) / 2)
+    # The same seeds once more change nothing.
+    more = np.concatenate([four, four])
+    assert scores.interquartile_mean([more, two]) == pytest.approx(25 / 4)
+    assert scores.interquartile_mean([four, four]) == 1.5
 
 
 def test_equal_runs_and_runs_that_diverged() -> None:

@@ -8,6 +8,7 @@ Everywhere below, ``by_task`` is a sequence with an array for each task, whose l
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -95,9 +96,20 @@ def interquartile_mean(by_task: Sequence[Array]) -> Any:
     """Mean of the middle half of all runs of all tasks together, over the last axis.
 
     Of n runs, floor(n / 4) are cut off at each end and none in part, as in rliable: with 6 runs the
-    mean is of the middle 4, with 3 of all.
+    mean is of the middle 4, with 3 of all. Every task counts the same: see :func:`_pooled`.
     """
-    return stats.trim_mean(np.concatenate(by_task, axis=-1), _TRIMMED, axis=-1)
+    return stats.trim_mean(_pooled(by_task), _TRIMMED, axis=-1)
+
+
+def _pooled(by_task: Sequence[Array]) -> Array:
+    """All runs of all tasks together, those of tasks with fewer runs as often as makes them equal.
+
+    Otherwise seeds added on one task would move the mean towards that task.
+    """
+    numbers = [np.shape(runs)[-1] for runs in by_task]
+    most = math.lcm(*numbers)
+    pairs = zip(by_task, numbers, strict=True)
+    return np.concatenate([np.repeat(runs, most // n, axis=-1) for runs, n in pairs], axis=-1)
 
 
 def iqm_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Estimate:
@@ -107,7 +119,7 @@ def iqm_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Estim
 
 def mean_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Estimate:
     """The mean over all runs with its stratified bootstrap interval."""
-    return _estimate(lambda all_: np.concatenate(all_, axis=-1).mean(axis=-1), by_task, resamples)
+    return _estimate(lambda all_: _pooled(all_).mean(axis=-1), by_task, resamples)
 
 
 def iqm_difference(
