@@ -66,6 +66,10 @@ JOINT_BELIEF: dict[str, Any] = {
     **LAMBDA_PATH, **BELIEF, **WHOLE_PAST,
     "tokens": "joint", "return_conditioning": "none", "time_embedding": "rotary",
 }  # fmt: skip
+# A transformer of one state is an MLP that foretells.
+ONE_STATE: dict[str, Any] = {**BELIEF, **_STATES, "context_length": 1, "state_path_width": 256}
+# 42 windows of 6 for 256 single steps.
+_WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
 TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-norm": {"td_lambda": 0.5, "critic_layer_norm": True},
     "lambda-path": LAMBDA_PATH,
@@ -84,14 +88,9 @@ TOGETHER: dict[str, dict[str, Any]] = {
     "lambda-path-42": {**LAMBDA_PATH, "batch_size": 42},
     "lambda-belief-joint-42": {**JOINT_BELIEF, "batch_size": 42},
     "lambda-belief-joint-42-ahead": {**JOINT_BELIEF, "batch_size": 42, "prediction_steps": 3},
-    # Whether it needs the past: a transformer of one state is an MLP that foretells.
-    "lambda-belief-one-state": {
-        **LAMBDA_PATH, **BELIEF, **_STATES,
-        "context_length": 1, "learnt_steps": K, "batch_size": 42,
-    },
+    # Whether it needs the past.
+    "lambda-belief-one-state": {**ONE_STATE, **_WINDOWS, "td_lambda": 0.5},
 }  # fmt: skip
-# 42 windows of 6 for 256 single steps.
-_WINDOWS: dict[str, Any] = {"learnt_steps": K, "batch_size": 42}
 SAC: dict[str, dict[str, Any]] = {
     "sac": {},
     "sac-critic-norm": {"critic_layer_norm": True},

@@ -16,7 +16,7 @@ import itertools
 import sys
 from typing import Any
 
-from improve import BELIEF, JOINT_BELIEF, PREDICTED, SAC, WHOLE_PAST, K
+from improve import JOINT_BELIEF, ONE_STATE, PREDICTED, SAC, WHOLE_PAST, K
 from study import Study, main_of_choices
 
 from sacformer_jax import Config
@@ -54,16 +54,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "belief-joint": _JOINT,
     # As many steps as SAC on windows learns from.
     "belief-joint-42": {**_JOINT, "batch_size": 42},
-    # Whether prediction needs the transformer: of one step, with the past stacked, it is an MLP.
+    # Whether prediction needs the transformer: an MLP that has the past stacked.
     "belief-one-step-targets": {**_BELIEF_SEQUENCE, "td_lambda": 0.0},
-    "belief-stacked": {
-        **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
-        "batch_size": 256, "stack_obs": K, "state_path_width": 256,
-    },
-    "belief-stacked-lambda": {
-        **BELIEF, "return_conditioning": "none", "time_embedding": "none", "context_length": 1,
-        "learnt_steps": K, "td_lambda": 0.5, "stack_obs": K, "state_path_width": 256,
-    },
+    "belief-stacked": {**ONE_STATE, "batch_size": 256, "stack_obs": K},
+    "belief-stacked-lambda": {**ONE_STATE, "learnt_steps": K, "td_lambda": 0.5, "stack_obs": K},
     "with-return": {"tokens": "gsa", **PREDICTED},
 }  # fmt: skip
 

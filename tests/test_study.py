@@ -276,26 +276,27 @@ def test_seeds_added_to_the_arena_are_as_the_first_five_but_others() -> None:
         assert config.replace(seed=100, run_dir=first.run.run_dir) == first
 
 
+def _differing(one: Config, other: Config) -> set[str]:
+    """Fields of two configurations that are not the same."""
+    of_other = other.flat()
+    return {name for name, value in one.flat().items() if of_other[name] != value}
+
+
 def test_preset_best_is_what_was_tuned() -> None:
     tuned = importlib.import_module("improve").study("100k").configs
     for agent, variant in {"sacformer": "lambda-belief-joint-42", "sac": "sac-lambda"}.items():
-        preset, other = (
-            Config.from_preset("best", env="Hopper", agent=agent),
-            tuned[f"Hopper-{variant}"],
-        )
+        preset = Config.from_preset("best", env="Hopper", agent=agent)
+        other = tuned[f"Hopper-{variant}"]
         # "effect" is a step where an action comes into effect at once.
         assert predicted_steps(preset) == predicted_steps(other)
-        flat, as_tuned = preset.flat(), other.flat()
-        differs = {name for name in flat if as_tuned[name] != flat[name]}
-        assert differs - {"prediction_steps"} == {"preset", "seeds", "run_dir"}
+        assert _differing(preset, other) - {"prediction_steps"} == {"preset", "seeds", "run_dir"}
 
 
 def test_preset_memory_is_what_was_tuned() -> None:
     tuned = importlib.import_module("memory").study("delay").configs
     for agent, variant in {"sacformer": "belief-joint-42", "sac": "sac-lambda"}.items():
         preset = Config.from_preset("memory", env="Hopper", agent=agent, action_delay=2)
-        other = tuned[f"Hopper-{variant}"].flat()
-        differs = {name for name, value in preset.flat().items() if other[name] != value}
+        differs = _differing(preset, tuned[f"Hopper-{variant}"])
         assert differs == {"preset", "total_env_steps", "seeds", "run_dir"}
 
 
@@ -319,8 +320,7 @@ def test_ablations_change_one_thing_of_the_preset() -> None:
         configs = importlib.import_module("ablations").study(scale).configs
         for run, config in configs.items():
             task = config.task.env
-            default = configs[f"{task}-sacformer"].flat()
-            changed = {name for name, value in config.flat().items() if value != default[name]}
+            changed = _differing(config, configs[f"{task}-sacformer"])
             changed -= {"run_dir", "prefill_env_steps"}
             allowed = {
                 "transformer-critic": {"critic", "critic_width", "critic_heads"},

@@ -118,7 +118,9 @@ def iqm_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Estim
 
 
 def mean_estimate(by_task: Sequence[Array], resamples: int = _RESAMPLES) -> Estimate:
-    """The mean over all runs with its stratified bootstrap interval."""
+    """The mean over all runs, every task counting the same, with its stratified bootstrap
+    interval.
+    """
     return _estimate(lambda all_: _pooled(all_).mean(axis=-1), by_task, resamples)
 
 

@@ -3,9 +3,9 @@
 Seconds are those of training, all seeds of a run together, without compilation and evaluations:
 they say something where runs had the same share of the same machine, as in the studies named here.
 So they are compared among runs of as many seeds on the same model of processor alone (which need
-not be the same machine, nor a machine with nothing else to do). An env step
-takes the median over the stretches between evaluations, all of them the same work: a run that was
-held up for a while is no slower for it.
+not be the same machine, nor a machine with nothing else to do). An env step takes the median over
+the stretches between evaluations, all of them the same work: a run that was held up for a while is
+no slower for it.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def step_seconds(line: Line, program: Program) -> float:
     """
     of_stretches: list[float] = []
     for seed, of_seed in line.seconds.items():
-        steps = np.array(sorted(of_seed), float) if line.programs[seed] == program else np.empty(0)
-        if steps.size > 1:
+        steps = np.array(sorted(of_seed), float)
+        if line.programs[seed] == program and steps.size > 1:
             of_stretches.extend(np.diff([of_seed[int(step)] for step in steps]) / np.diff(steps))
     return float(np.median(of_stretches)) if of_stretches else math.nan
 
