@@ -7,6 +7,7 @@ every value is kept, so that ``sacformer describe`` can print it.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -24,12 +25,14 @@ class Layer:
       values: fields by bare name.
       agent: only for this agent, if given.
       env: only for this environment, if given.
+      conditioned: only for a policy that is conditioned on returns, if true.
     """
 
     source: str
     values: dict[str, Any]
     agent: str | None = None
     env: str | None = None
+    conditioned: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,9 +43,17 @@ class Resolved:
     sources: dict[str, str]
 
 
-TASK_LAYERS: dict[str, Callable[[str, dict[str, Any]], tuple[Layer, ...]]] = {}
+TASK_LAYERS: dict[str, Callable[[str], tuple[Layer, ...]]] = {}
 """By the prefix of an environment's name, what is known of such tasks beside the presets: takes the
-name after the prefix and the values given by the user. :mod:`sacformer_jax.envs` fills it."""
+name after the prefix. :mod:`sacformer_jax.envs` fills it."""
+
+UNKNOWN_TARGET = Layer(
+    "no target is known: the best return so far, or 0",
+    {"target_return": "auto"},
+    agent="sacformer",
+    conditioned=True,
+)
+"""Of tasks whose good returns nobody has told."""
 
 
 # A good SAC policy's return at 1 M steps: rounded from published tables (SB3 zoo, Tianshou).
@@ -253,33 +264,34 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
     chosen = config.replace(**{k: v for k, v in fields.items() if k in ("agent", "env")})
     layers = [
         layer
-        for layer in (*PRESETS[preset], *_task_layers(chosen.task.env, fields))
+        for layer in (*PRESETS[preset], *_task_layers(chosen.task.env))
         if layer.agent in (None, chosen.agent) and layer.env in (None, chosen.task.env)
     ]
     if fields.get("dataset"):
         layers.append(Layer("the dataset is there instead", {"prefill_env_steps": 0}))
-    for layer in [*layers, Layer(given, fields)]:
+    layers.append(Layer(given, fields))
+    settled = collections.ChainMap(*(layer.values for layer in reversed(layers)))
+    conditioned = settled.get("return_conditioning") != "none"
+    for layer in layers:
+        if layer.conditioned and not conditioned:
+            continue
         config = config.replace(**layer.values)
         sources.update(dict.fromkeys(layer.values, layer.source))
     return Resolved(config, sources)
 
 
-def _task_layers(env: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def _task_layers(env: str) -> tuple[Layer, ...]:
     if env_names.is_own(env):
-        return _own_layers(env, fields)
+        return _own_layers(env)
     for prefix, layers_of in TASK_LAYERS.items():
         if env.startswith(prefix):
-            return layers_of(env.removeprefix(prefix), fields)
+            return layers_of(env.removeprefix(prefix))
     return ()
 
 
-def _own_layers(env: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def _own_layers(env: str) -> tuple[Layer, ...]:
     """What is known of an environment of the user's own."""
     limit = env_names.own_limit(env)
-    layers = []
-    if limit is not None:
-        layers.append(Layer("the environment's own time limit", {"max_episode_steps": limit}))
-    if fields.get("return_conditioning") != "none":
-        why = "no target is known: the best return so far, or 0"
-        layers.append(Layer(why, {"target_return": "auto"}, agent="sacformer"))
-    return tuple(layers)
+    if limit is None:
+        return (UNKNOWN_TARGET,)
+    return (Layer("the environment's own time limit", {"max_episode_steps": limit}), UNKNOWN_TARGET)

@@ -326,6 +326,7 @@ def test_the_ids_own_limit_and_threshold_are_the_defaults():
     # An agent that looks at no return, and one told not to.
     Config.from_preset("cpu", env="gym:Pendulum-v1", agent="sac")
     Config.from_preset("cpu", env="gym:Pendulum-v1", return_conditioning="none")
+    Config.from_preset("best", env="gym:Pendulum-v1")
     assert Config.from_preset("cpu", env="gym:Tests/Told-v0").task.max_episode_steps == 1000
 
 

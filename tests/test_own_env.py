@@ -143,7 +143,13 @@ def test_the_environments_own_limit_is_the_default_and_no_return_is_made_up(name
     given = {"max_episode_steps": 7, "target_return": -1.0, "env": "probe:PointEnv"}
     config = Config.from_preset("cpu", **given)
     assert (config.task.max_episode_steps, config.context.target_return) == (7, -1.0)
-    Config.from_preset("cpu", env="probe:PointEnv", return_conditioning="none")  # no target
+    # Where no return is looked at there is no target, whoever said so.
+    for preset, given in (("cpu", {"return_conditioning": "none"}), ("best", {}), ("memory", {})):
+        unconditioned = resolve(preset, {"env": "probe:PointEnv", **given})
+        unconditioned.config.validated()
+        assert unconditioned.sources["target_return"].startswith("default")
+    looking = Config.from_preset("best", env="probe:PointEnv", return_conditioning="commanded")
+    assert looking.context.target_return == "auto"
     for agent in ("sac", "ppo"):
         Config.from_preset("cpu", env="probe:PointEnv", agent=agent)
     assert Config.from_preset("cpu", env="Hopper").task.max_episode_steps == 1000

@@ -152,6 +152,7 @@ def test_the_tasks_own_episode_and_highest_return_are_the_defaults(registered):
     assert config.task.max_episode_steps == LIMIT
     walk = Config.from_preset("cpu", env="playground:Go1JoystickFlatTerrain")
     assert walk.context.target_return == "auto"
+    Config.from_preset("memory", env="playground:Go1JoystickFlatTerrain")  # looks at no return
 
 
 @pytest.mark.slow

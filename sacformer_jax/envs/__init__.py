@@ -122,16 +122,16 @@ def as_brax(env: Env) -> BraxView:
     return as_brax(env)
 
 
-def _gym_layers(env_id: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def _gym_layers(env_id: str) -> tuple[Layer, ...]:
     from sacformer_jax.envs.gym_registry import task_layers
 
-    return task_layers(env_id, fields)
+    return task_layers(env_id)
 
 
-def _playground_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def _playground_layers(name: str) -> tuple[Layer, ...]:
     from sacformer_jax.envs.playground_env import task_layers
 
-    return task_layers(name, fields)
+    return task_layers(name)
 
 
 TASK_LAYERS[GYM_PREFIX] = _gym_layers

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import importlib
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec as RegisteredSpec
 
 from sacformer_jax.config import ConfigError
 from sacformer_jax.envs.gym_live import GymFacts, make
-from sacformer_jax.presets import Layer
+from sacformer_jax.presets import UNKNOWN_TARGET, Layer
 
 DEFAULT_LIMIT = 1000
 """Time limit of an environment that is registered without one."""
@@ -70,7 +69,7 @@ def time_limit(spec: RegisteredSpec) -> int:
     return spec.max_episode_steps or DEFAULT_LIMIT
 
 
-def task_layers(env_id: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def task_layers(env_id: str) -> tuple[Layer, ...]:
     """Settings that the registry knows better than our defaults.
 
     Raises:
@@ -87,9 +86,8 @@ def task_layers(env_id: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
                 {"target_return": target, "return_scale": scale},
             )
         )
-    elif fields.get("return_conditioning") != "none":
-        why = "no target is known: the best return so far, or 0"
-        layers.append(Layer(why, {"target_return": "auto"}, agent="sacformer"))
+    else:
+        layers.append(UNKNOWN_TARGET)
     return tuple(layers)
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from sacformer_jax.config import ConfigError
 from sacformer_jax.env_names import playground_limit
 from sacformer_jax.envs.core import EnvSpec, EnvStep, JaxEnv
-from sacformer_jax.presets import Layer
+from sacformer_jax.presets import UNKNOWN_TARGET, Layer
 
 
 def _playground() -> ModuleType:
@@ -50,7 +50,7 @@ def playground_names() -> list[str]:
     return sorted(name for suite in suites for name in suite.ALL_ENVS)
 
 
-def task_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
+def task_layers(name: str) -> tuple[Layer, ...]:
     """Settings that Playground knows better than our defaults.
 
     Raises:
@@ -62,9 +62,8 @@ def task_layers(name: str, fields: dict[str, Any]) -> tuple[Layer, ...]:
         # Rewards are at most 1 there, whatever the task.
         values = {"target_return": float(limit), "return_scale": limit / 10}
         layers.append(Layer("the highest return there is, and a tenth of it", values))
-    elif fields.get("return_conditioning") != "none":
-        why = "no target is known: the best return so far, or 0"
-        layers.append(Layer(why, {"target_return": "auto"}, agent="sacformer"))
+    else:
+        layers.append(UNKNOWN_TARGET)
     return tuple(layers)
 
 
