@@ -14,7 +14,7 @@ import orbax.checkpoint as ocp
 
 from sacformer_jax import processes, stored
 from sacformer_jax.config import Config
-from sacformer_jax.cores import usable_cores
+from sacformer_jax.cores import xla_threads
 from sacformer_jax.run_folder import Restored, RunConfigFile, RunFolder
 from sacformer_jax.saved_policies import kept_best, prune_best, restore_policy, save_best
 from sacformer_jax.stored import (
@@ -58,10 +58,19 @@ class CheckpointWriter:
       config: kept with each checkpoint, to tell when ``config.json`` was changed.
       block_axes: of the digests of the state's leaves, a PyTree of ints like it: at least the axes
         that are split over processes; None: 0 of all.
+      devices: over how many what is split, by name, to tell when it is split otherwise; None: it is
+        not told.
     """
 
-    def __init__(self, folder: RunFolder, config: Config, block_axes: Any = None):
+    def __init__(
+        self,
+        folder: RunFolder,
+        config: Config,
+        block_axes: Any = None,
+        devices: dict[str, int] | None = None,
+    ):
         self._folder, self._config, self._block_axes = folder, config, block_axes
+        self._devices = devices
         self._manager: ocp.CheckpointManager | None = None
         self._writing: int | None = None
         self._silence = contextlib.ExitStack()
@@ -109,7 +118,8 @@ class CheckpointWriter:
             {
                 "config": self._config.to_dict(),
                 "progress": dataclasses.asdict(progress),
-                "host_threads": usable_cores(),
+                "host_threads": xla_threads(),
+                "devices": self._devices,
                 "items": {
                     "state": stored.described(state, self._block_axes),
                     "policy": stored.described(policy, each),

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sacformer_jax.digests import num_bytes
-from sacformer_jax.logging import Record
+from sacformer_jax.logging import Record, rank
 from sacformer_jax.population import Population
 from sacformer_jax.run_folder import RunFolder
 from sacformer_jax.types import TrainState
@@ -166,7 +166,7 @@ class Reporter:
         for column in ("member", "env steps", "return", "std", "best", "at env steps"):
             table.add_column(column, justify="left" if column == "member" else "right")
         for name, records in evaluations.items():
-            last, best = records[-1], max(records, key=lambda record: record["return_mean"])
+            last, best = records[-1], max(records, key=rank)
             table.add_row(
                 name,
                 f"{last['env_steps']:,}",

@@ -26,10 +26,12 @@ class Evaluation:
     Attributes:
       returns: ``[E]`` undiscounted sums of reward.
       lengths: int32 ``[E]`` steps.
+      bad: bool ``[E]``, whose physics broke down: it was cut off there.
     """
 
     returns: jax.Array
     lengths: jax.Array
+    bad: jax.Array
 
 
 @flax.struct.dataclass
@@ -76,7 +78,9 @@ def episode_functions(env: VectorEnv, agent: Agent, context_length: int) -> Epis
             key=jax.random.fold_in(key, _ACTING_STREAM),
             running=jnp.ones(env.num_envs, bool),
             result=Evaluation(
-                returns=jnp.zeros(env.num_envs), lengths=jnp.zeros(env.num_envs, jnp.int32)
+                returns=jnp.zeros(env.num_envs),
+                lengths=jnp.zeros(env.num_envs, jnp.int32),
+                bad=jnp.zeros(env.num_envs, bool),
             ),
         )
 
@@ -93,6 +97,7 @@ def episode_functions(env: VectorEnv, agent: Agent, context_length: int) -> Epis
             result=Evaluation(
                 returns=episodes.result.returns + reward,
                 lengths=episodes.result.lengths + episodes.running,
+                bad=episodes.result.bad | (episodes.running & step.bad),
             ),
         )
 

@@ -65,8 +65,9 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
             folder.member_path(run.members[place].name), target.member_path(member.name)
         )  # fmt: skip
         goal.mkdir(exist_ok=True)
-        metrics = folder.metrics_path(run.members[place].name).read_bytes()[:num_bytes]
-        target.metrics_path(member.name).write_bytes(metrics)
+        metrics = folder.metrics_path(run.members[place].name)
+        if metrics.exists():
+            target.metrics_path(member.name).write_bytes(metrics.read_bytes()[:num_bytes])
         if (source / "best").is_dir():
             shutil.copytree(source / "best", goal / "best")
     with CheckpointWriter(target, config, block_axes) as writer:

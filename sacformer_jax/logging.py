@@ -18,7 +18,8 @@ two equal runs write equal files. Every line has ``kind``, ``env_steps`` and ``u
   ``action_error`` (mean distance of the mean action to that shown, in units of the action),
   ``skipped_updates``.
 ``kind = "eval"``, one line an evaluation:
-  ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``.
+  ``episodes``, ``return_mean``, ``return_std``, ``return_min``, ``return_max``, ``length_mean``,
+  ``bad_physics`` (episodes cut off there).
 
 Of several members each has such a file of its own; ``timings.jsonl`` is the run's and has a line a
 chunk: ``env_steps``, ``updates``, ``chunk_seconds``, ``steps_per_second``, ``ms_per_update`` (each
@@ -35,8 +36,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from tensorboardX import SummaryWriter
 from tensorboardX.summary import hparams
@@ -58,7 +60,9 @@ class _Log:
     """Appends records to a JSONL file, and their numbers to TensorBoard."""
 
     def __init__(self, path: Path, keep_bytes: int, tensorboard_dir: Path, purge_after: int | None):
-        self._file = _open_cut(path, keep_bytes)
+        self._file = path.open("r+b" if path.exists() else "wb")
+        self._file.truncate(keep_bytes)
+        self._file.seek(0, 2)
         self._writer = SummaryWriter(
             str(tensorboard_dir),
             purge_step=0 if purge_after is None else purge_after + 1,
@@ -84,7 +88,8 @@ class MetricLog(_Log):
     Args:
       path: the JSONL file.
       tensorboard_dir: folder of TensorBoard events.
-      keep_bytes: length to cut the file back to, when a run is resumed.
+      keep_bytes: length to cut the file back to, when a run is resumed; to less where what is there
+        ends earlier in whole records.
       purge_after: environment steps after which TensorBoard events are dropped, on resume; None
         drops all of them, for a run that starts.
       settings: of the member, for TensorBoard's page of hyperparameters.
@@ -98,7 +103,9 @@ class MetricLog(_Log):
         purge_after: int | None = None,
         settings: dict[str, Any] | None = None,
     ):
-        super().__init__(path, keep_bytes, tensorboard_dir, purge_after)
+        whole = max((end for _, end in _records(path) if end <= keep_bytes), default=0)
+        super().__init__(path, whole, tensorboard_dir, purge_after)
+        self.lost_bytes = keep_bytes - whole
         if settings:
             self._add_settings(settings)
 
@@ -138,23 +145,27 @@ class TimingLog(_Log):
         return record
 
 
-def _open_cut(path: Path, keep_bytes: int) -> BinaryIO:
-    """Opens a file, new or not, to append after its first ``keep_bytes``."""
-    file = path.open("r+b" if path.exists() else "wb")
-    file.truncate(keep_bytes)
-    file.seek(0, 2)
-    return file
+def _records(path: Path) -> Iterator[tuple[Record, int]]:
+    """Records and where each ends, up to the first line that is none, as a crash may leave it."""
+    end = 0
+    for line in path.read_bytes().splitlines(keepends=True) if path.exists() else ():
+        try:
+            record = json.loads(line)
+        except ValueError:
+            return
+        if not line.endswith(b"\n"):
+            return
+        end += len(line)
+        yield record, end
 
 
 def _timing_bytes(path: Path, keep_until: int | None) -> int:
     """Length of the whole records up to ``keep_until`` env steps; None: no record."""
     length = 0
-    if keep_until is None or not path.exists():
-        return length
-    for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n") or json.loads(line)["env_steps"] > keep_until:
+    for record, end in _records(path) if keep_until is not None else ():
+        if record["env_steps"] > keep_until:
             break
-        length += len(line)
+        length = end
     return length
 
 
@@ -163,6 +174,11 @@ def read_records(path: Path, kind: str | None = None) -> list[Record]:
     with path.open() as lines:
         records = [json.loads(line) for line in lines]
     return [record for record in records if kind in (None, record.get("kind"))]
+
+
+def rank(evaluation: Record) -> tuple[bool, float]:
+    """Greater is better. Episodes that were cut off look good where rewards are negative."""
+    return not evaluation.get("bad_physics"), evaluation["return_mean"]
 
 
 def write_csv(records: list[Record], kind: str, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -24,7 +25,7 @@ from sacformer_jax.checkpoint import (
 from sacformer_jax.console import Reporter
 from sacformer_jax.evaluate import Evaluation
 from sacformer_jax.fault_report import report_fault
-from sacformer_jax.logging import MetricLog, Record, TimingLog
+from sacformer_jax.logging import MetricLog, Record, TimingLog, rank
 from sacformer_jax.population import Population, member_counters, member_metrics
 from sacformer_jax.processes import any_process, gathered, is_first
 from sacformer_jax.signals import stop_on_signal
@@ -46,6 +47,7 @@ def summarize(evaluation: Evaluation) -> Record:
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "length_mean": float(lengths.mean()),
+        "bad_physics": int(np.sum(evaluation.bad)),
     }
 
 
@@ -100,6 +102,7 @@ class Loop:
                         self.folder,
                         self.config,
                         self.population.stored(self.population.block_axes),
+                        dataclasses.asdict(self.population.devices),
                     )
                 )
                 env_steps = self._chunks(state, train_chunk, writer)
@@ -129,6 +132,11 @@ class Loop:
             )
             self._logs.append(log)
             stack.callback(log.close)
+            if log.lost_bytes:
+                self.reporter.say(
+                    f"note: {folder.metrics_path(name)} has lost its records after byte "
+                    f"{log.num_bytes}; training goes on where it was"
+                )
         # A folder of its own: TensorBoard follows one file of a folder at a time.
         tensorboard = folder.path / "tensorboard" / "timings"
         self._timings = TimingLog(folder.timings_path, tensorboard, purge_after)
@@ -238,8 +246,10 @@ class Loop:
                 record = self._logs[index].write("eval", env_steps, updates, record)
             records[name] = record
             best = self.best[index]
-            if best is None or record["return_mean"] > best.return_mean:
-                self.best[index] = BestSoFar(env_steps, record["return_mean"])
+            if best is None or rank(record) > rank(dataclasses.asdict(best)):
+                self.best[index] = BestSoFar(
+                    env_steps, record["return_mean"], record["bad_physics"]
+                )
                 improved.append(index)
         self.reporter.evaluated(env_steps, list(records.values()))
         if improved:

@@ -248,6 +248,13 @@ def _check_members(config: Config, members: Sequence[Member]) -> None:
                     f"values of member {member.name!r}: {name!r} is not a setting in which members "
                     f"can differ; those are {', '.join(numbers)}"
                 )
+        if "target_return" in member.values:
+            run, own = config.context.target_return, member.values["target_return"]
+            if "auto" in (run, own):
+                raise ConfigError(
+                    f"values of member {member.name!r}: target_return={own!r} in a run with "
+                    f"target_return={run!r}: members may differ in it where all are numbers"
+                )
         member.config(config).validated()
 
 

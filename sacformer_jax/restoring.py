@@ -26,14 +26,17 @@ class Restored:
     Attributes:
       state: the whole train state.
       progress: of the host loop.
-      host_threads: CPU threads of the process that wrote it; sums are split over them, so only
-        the same number continues bit for bit.
+      host_threads: XLA's CPU threads in the process that wrote it; sums are split over them, so
+        only the same number continues bit for bit.
+      devices: over how many of them what was split, by name, of which the same holds; empty where
+        that is not known.
       moved_aside: a line on each newer checkpoint that was damaged.
     """
 
     state: TrainState
     progress: Progress
     host_threads: int
+    devices: dict[str, int]
     moved_aside: tuple[str, ...]
 
 
@@ -69,7 +72,13 @@ def restore_newest(
             moved.append(line)
             continue
         progress = Progress.from_dict(metadata["progress"])
-        return Restored(state, progress, metadata["host_threads"], tuple(moved))
+        return Restored(
+            state=state,
+            progress=progress,
+            host_threads=metadata["host_threads"],
+            devices=metadata.get("devices") or {},
+            moved_aside=tuple(moved),
+        )
     if moved:
         raise CheckpointError(
             f"run {str(run)!r} has no checkpoint left that is good: " + "; ".join(moved)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -13,7 +14,7 @@ from sacformer_jax.callbacks import Callback, Callbacks
 from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
-from sacformer_jax.cores import usable_cores
+from sacformer_jax.cores import xla_threads
 from sacformer_jax.datasets import described, read_episodes
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
@@ -105,12 +106,13 @@ def resume(
       total_env_steps: train up to here instead of the configured total.
       quiet: print nothing.
       devices: how the members lie on devices, as in :func:`train`; it may be another way than that
-        of before (with other ``data`` right, but no longer bit for bit the same).
+        of before (right, but no longer bit for bit the same).
       callbacks: as in :func:`train`; those of before are not remembered.
 
     Raises:
       CheckpointError: there is nothing to resume, or every checkpoint is damaged.
-      ConfigError: ``total_env_steps`` has been reached already.
+      ConfigError: ``total_env_steps`` has been reached already, or is before a replay that was not
+        saved is filled again.
       DivergedError: too many updates were not finite.
       Exception: what a callback raised; the run was saved.
     """
@@ -125,6 +127,14 @@ def resume(
             f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
             f"{latest} already; give more with --total-env-steps"
         )
+    if latest is not None and not config.run.checkpoint_replay:
+        again = config.prefill_vector_steps * config.task.num_envs
+        if latest + again >= config.run.total_env_steps:
+            raise ConfigError(
+                f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
+                f"{latest}, and its replay, which was not saved, takes {again} to fill again; give "
+                "more with --total-env-steps"
+            )
     population = make_population(config, run.members, devices or Devices.for_members(num_members))
     check_memory(population)
 
@@ -145,11 +155,18 @@ def resume(
                     state, _ = jax.block_until_ready(population.refill(state))
             reporter.facts(population, state, folder.path)
             reporter.say(f"resuming at  {restored.progress.env_steps:,} env steps")
-            if restored.host_threads != usable_cores():
-                reporter.say(
-                    f"note: saved with {restored.host_threads} CPU threads, continued with "
-                    f"{usable_cores()}: right, but not bit for bit the same"
-                )
+            for what, before, now in (
+                ("CPU threads", restored.host_threads, xla_threads()),
+                *(
+                    (f"devices for the {axis}", restored.devices.get(axis, number), number)
+                    for axis, number in dataclasses.asdict(population.devices).items()
+                ),
+            ):
+                if before != now:
+                    reporter.say(
+                        f"note: saved with {before} {what}, continued with {now}: right, but not "
+                        "bit for bit the same"
+                    )
             progress = restored.progress
             return _train_on(population, folder, reporter, callbacks, state, progress)
 

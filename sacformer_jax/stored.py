@@ -59,10 +59,12 @@ class BestSoFar:
     Attributes:
       env_steps: when it was; its policy is kept under this step.
       return_mean: mean return of its episodes.
+      bad_physics: how many of them were cut off because the physics broke down.
     """
 
     env_steps: int
     return_mean: float
+    bad_physics: int = 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from sacformer_jax.config import MLP_AGENTS, Config, ConfigError, TaskConfig, shortest_column
+from sacformer_jax.config import (
+    MLP_AGENTS,
+    Config,
+    ConfigError,
+    ContextConfig,
+    TaskConfig,
+    shortest_column,
+)
 
 _AT_LEAST_ONE = (
     "num_envs", "max_episode_steps", "total_env_steps", "eval_every", "eval_episodes",
@@ -158,11 +165,10 @@ def _check_actor(config: Config) -> None:
             f"actor_width={actor.actor_width} over actor_heads={actor.actor_heads} is odd; use an "
             "even width of heads, or another time_embedding",
         )
-        _require(
-            context.tokens == "gs" or context.context_length > 1,
-            f"tokens={context.tokens!r}: with context_length=1 there is no action before the "
-            "state; use context_length of 2 or more",
-        )
+        if context.tokens != "gs":
+            _check_past_in_training(
+                context, f"tokens={context.tokens!r}", "there is no action before the state", "gs"
+            )
 
 
 def _check_policy(config: Config) -> None:
@@ -170,6 +176,19 @@ def _check_policy(config: Config) -> None:
         config.policy.policy == "gaussian" or not config.learning.tune_alpha,
         "tune_alpha=True: policy=deterministic has no entropy to tune it by; use "
         "tune_alpha=False, or policy=gaussian",
+    )
+
+
+def _check_past_in_training(context: ContextConfig, given: str, why: str, off: str) -> None:
+    """Refuses a setting that makes nothing of windows of a single step."""
+    name = given.partition("=")[0]
+    _require(
+        context.context_length > 1,
+        f"{given}: with context_length=1 {why}; use {name}={off}, or context_length of 2 or more",
+    )
+    _require(
+        context.window_length > 1,
+        f"{given}: with learnt_steps=1 and burn_in=0 {why}; use {name}={off}, or more of either",
     )
 
 
@@ -331,10 +350,11 @@ def _check_acting(config: Config) -> None:
         f"acting_context={context.acting_context!r}: agent={config.agent} sees one state; use "
         "acting_context=window, or agent=sacformer",
     )
-    _require(
-        context.context_length > 1,
-        f"acting_context={context.acting_context!r}: with context_length=1 training never shows "
-        "what came before; use acting_context=window, or context_length of 2 or more",
+    _check_past_in_training(
+        context,
+        f"acting_context={context.acting_context!r}",
+        "training never shows what came before",
+        "window",
     )
     _require(
         limit is None or limit >= context.context_length,
@@ -353,11 +373,7 @@ def _check_critic(config: Config) -> None:
         f"critic={critic.critic!r}: agent={config.agent} sees one step; use critic=mlp, or "
         "agent=sacformer",
     )
-    _require(
-        config.context.context_length > 1,
-        f"critic={critic.critic!r}: with context_length=1 it sees one step; use critic=mlp, or "
-        "context_length of 2 or more",
-    )
+    _check_past_in_training(config.context, f"critic={critic.critic!r}", "it sees one step", "mlp")
     _require(
         critic.critic_width % critic.critic_heads == 0,
         f"critic_heads={critic.critic_heads}: must divide critic_width={critic.critic_width}",

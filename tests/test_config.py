@@ -399,6 +399,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"hindsight_scale": "none"}, "hindsight_scale='none'"),
     ({"acting_context": "all"}, "acting_context='all'"),
     ({"acting_context": "episode", "context_length": 1}, "context_length of 2"),
+    *(
+        ({**what, "learnt_steps": 1}, "with learnt_steps=1 and burn_in=0")
+        for what in ({"acting_context": "episode"}, {"tokens": "joint"}, {"critic": "transformer"})
+    ),
     ({"acting_context_limit": 0}, "acting_context_limit=0"),
     ({"acting_context_limit": 5, "acting_context": "episode"}, "context_length=6"),
     ({"policy": "categorical"}, "policy='categorical'"),

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from sacformer_jax.cores import usable_cores
+from sacformer_jax.cores import usable_cores, xla_threads
 
 
 def test_only_the_cores_given_to_this_process_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,3 +22,25 @@ def test_a_system_that_does_not_tell(
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: there_are)
     assert usable_cores() == expected
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({}, 5),
+        ({"NPROC": "3"}, 3),
+        ({"PJRT_NPROC": "2", "NPROC": "3"}, 2),
+        ({"PJRT_NPROC": "all", "NPROC": "3"}, 3),
+        ({"PJRT_NPROC": ""}, 5),
+    ],
+    ids=str,
+)
+def test_threads_of_xla(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: int
+) -> None:
+    for name in ("PJRT_NPROC", "NPROC"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("sacformer_jax.cores.usable_cores", lambda: 5)
+    assert xla_threads() == expected

@@ -103,7 +103,7 @@ def test_the_metrics_of_training_are_explained() -> None:
 
 
 def test_the_metrics_of_evaluation_are_explained() -> None:
-    written = summarize(Evaluation(returns=np.zeros(2), lengths=np.ones(2)))
+    written = summarize(Evaluation(returns=np.zeros(2), lengths=np.ones(2), bad=np.ones(2, bool)))
     explained = _first_cells(_section(_page("metrics"), "Evaluation: `kind` is `eval`"))
     assert sorted(explained) == sorted(written)
 

@@ -110,10 +110,37 @@ def test_resuming_cuts_the_metrics_back_and_goes_on_after(tmp_path: Path) -> Non
     path.write_bytes(path.read_bytes() + b'{"kind": "train", "env_st')  # killed while writing
 
     log = _open(tmp_path, keep_bytes=keep_bytes, purge_after=100)
-    assert log.num_bytes == keep_bytes
+    assert (log.num_bytes, log.lost_bytes) == (keep_bytes, 0)
     again = log.write("eval", 200, 0, {"return_mean": 3.0})
     log.close()
     assert _lines(path) == [kept, again]
+
+
+@pytest.mark.parametrize("left", ["nothing", "a part", "zeros"])
+def test_a_file_that_lost_its_end_goes_on_after_its_last_whole_record(
+    tmp_path: Path, left: str
+) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = _open(tmp_path)
+    first = log.write("eval", 100, 0, {"return_mean": 1.0})
+    one = log.num_bytes
+    log.write("eval", 200, 0, {"return_mean": 2.0})
+    keep_bytes = log.num_bytes
+    log.close()
+    content = path.read_bytes()
+    path.unlink()
+    if left == "a part":
+        path.write_bytes(content[: keep_bytes - 5])
+    elif left == "zeros":  # as some file systems leave it when the power fails
+        path.write_bytes(content[:one] + bytes(keep_bytes - one))
+
+    log = _open(tmp_path, keep_bytes=keep_bytes, purge_after=200)
+    kept = [] if left == "nothing" else [first]
+    assert log.num_bytes == one * len(kept)
+    assert log.lost_bytes == keep_bytes - log.num_bytes
+    after = log.write("eval", 300, 0, {"return_mean": 3.0})
+    log.close()
+    assert _lines(path) == [*kept, after]
 
 
 def test_a_new_log_empties_what_lay_there(tmp_path: Path) -> None:
@@ -124,16 +151,19 @@ def test_a_new_log_empties_what_lay_there(tmp_path: Path) -> None:
     assert _lines(tmp_path / "metrics.jsonl") == [record]
 
 
-@pytest.mark.parametrize(("purge_after", "kept"), [(None, []), (1, [1]), (2, [1, 2])])
+@pytest.mark.parametrize("end", [b'{"env_st', bytes(9), bytes(9) + b"\n"], ids=repr)
+@pytest.mark.parametrize(
+    ("purge_after", "kept"), [(None, []), (1, [1]), (2, [1, 2]), (9, [1, 2, 3])]
+)
 def test_timings_are_cut_back_to_where_the_run_goes_on(
-    tmp_path: Path, purge_after: int | None, kept: list[int]
+    tmp_path: Path, purge_after: int | None, kept: list[int], end: bytes
 ) -> None:
     path = tmp_path / "timings.jsonl"
     log = _open_timings(tmp_path)
     for env_steps in (1, 2, 3):
         log.write(env_steps, 0, {"chunk_seconds": 0.5})
     log.close()
-    path.write_bytes(path.read_bytes() + b'{"env_st')  # killed while writing
+    path.write_bytes(path.read_bytes() + end)
 
     log = _open_timings(tmp_path, purge_after)
     log.write(9, 0, {"chunk_seconds": 0.5})

@@ -244,6 +244,10 @@ def test_a_member_with_a_setting_that_cannot_work_is_refused() -> None:
         make(config, [Member("a", 0, {"batch_size": 8})])
     with pytest.raises(ConfigError, match=r"'lr'"):
         make(config, [Member("a", 0, {"lr": 8})])
+    for run, own in (("auto", 5.0), (5.0, "auto")):
+        asking = config.replace(target_return=run)
+        with pytest.raises(ConfigError, match=f"target_return={own!r} in a run .*{run!r}"):
+            make(asking, [Member("a", 0, {"target_return": own})])
     with pytest.raises(ConfigError, match="two members are called 'a'"):
         make(config, [Member("a", 0), Member("a", 1)])
     with pytest.raises(ConfigError, match="at least one"):

@@ -27,11 +27,13 @@ from sacformer_jax import (
     agents,
     evaluate,
     load_policy,
+    loop,
     resume,
     runner,
     train,
 )
-from sacformer_jax.cores import usable_cores
+from sacformer_jax.checkpoint import Restored, RunFolder
+from sacformer_jax.cores import xla_threads
 from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
 from sacformer_jax.train import hyperparameters, policy_state
@@ -173,6 +175,8 @@ def test_checkpoints_without_the_replay_are_small_and_collect_it_anew(
         parts.append({name.split(".")[1] for name in metadata["items"]["state"]})
     assert parts[0] - parts[1] == {"buffer", "env", "context"}
     before = load_policy(path, "latest").state
+    with pytest.raises(ConfigError, match=r"=600: .* done 400, .* takes 200 to fill"):
+        resume(path, total_env_steps=600)
     result = resume(path, total_env_steps=800)
     assert "no replay was saved: collecting one under the policy" in capsys.readouterr().out
     # 200 steps to fill the replay again, without an update; then as ever.
@@ -193,16 +197,40 @@ def test_the_result_of_a_resumed_run_covers_all_of_it(straight: Outcome, resumed
     assert (resumed.result.path / "learning_curve.png").is_file()
 
 
-def test_resuming_on_other_cores_says_that_it_is_not_exact(
+def test_a_run_whose_metrics_are_lost_goes_on(
+    straight: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _killed(straight, tmp_path / "run")
+    (path / "metrics.jsonl").unlink()
+    result = resume(path)
+    assert "has lost its records after byte 0" in " ".join(capsys.readouterr().out.split())
+    assert state_digest(path) == state_digest(straight.result.path)
+    later = [record for record in straight.result.evaluations if record["env_steps"] > STOP]
+    assert result.evaluations == later
+    assert len((path / "eval.csv").read_text().splitlines()) == 1 + len(later)
+
+
+def test_resuming_on_other_cores_or_devices_says_that_it_is_not_exact(
     straight: Outcome, resumed: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    here = usable_cores()
-    monkeypatch.setattr(runner, "usable_cores", lambda: here + 1)
+    restore = RunFolder.restore
+
+    def on_others(*arguments: Any) -> Restored:
+        restored = restore(*arguments)
+        assert restored.devices == {"members": 1, "data": 1}
+        return dataclasses.replace(restored, devices={"members": 4, "data": 1})
+
+    monkeypatch.setattr(RunFolder, "restore", on_others)
+    here = xla_threads()
+    monkeypatch.setattr(runner, "xla_threads", lambda: here + 1)
     monkeypatch.setattr(runner, "_train_on", lambda *_: resumed.result)
     resume(_killed(straight, tmp_path / "run"))
     note = f"note: saved with {here} CPU threads, continued with {here + 1}"
-    assert note in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert note in said
+    assert "note: saved with 4 devices for the members, continued with 1: right" in said
+    assert "for the data" not in said
     assert "note: saved with" not in resumed.printed
 
 
@@ -259,6 +287,7 @@ TRAIN_FIELDS = {
 PPO_FIELDS = {"approx_kl", "clip_fraction", "explained_variance", "learning_rate"}
 EVAL_FIELDS = {
     "episodes", "return_mean", "return_std", "return_min", "return_max", "length_mean",
+    "bad_physics",
 }  # fmt: skip
 TIMING_FIELDS = {
     "chunk_seconds", "steps_per_second", "ms_per_update", "wall_seconds",
@@ -299,7 +328,7 @@ def test_metrics_make_sense(straight: Outcome) -> None:
         assert record["actor_grad_norm"] > 0
         assert record["critic_grad_norm"] > 0
     for record in straight.result.evaluations:
-        assert record["episodes"] == 2
+        assert (record["episodes"], record["bad_physics"]) == (2, 0)
         assert record["return_min"] <= record["return_mean"] <= record["return_max"]
         # Of two values, the standard deviation is half their distance.
         spread = (record["return_max"] - record["return_min"]) / 2
@@ -324,6 +353,22 @@ def test_checkpoints_come_when_they_should(straight: Outcome) -> None:
     assert {p.name for p in (path / "checkpoints").iterdir()} == {"400", "600"}
     best = max(straight.result.evaluations, key=lambda record: record["return_mean"])
     assert [p.name for p in (path / "best").iterdir()] == [str(best["env_steps"])]
+
+
+def test_an_evaluation_that_physics_cut_off_is_not_the_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted = iter([(10.0, 1), (-100.0, 0), (50.0, 2)])  # at 200, 400 and 600 steps
+
+    def summarize(_: Any) -> dict[str, Any]:
+        return_mean, bad_physics = next(scripted)
+        record = dict.fromkeys(EVAL_FIELDS, 2.0)
+        return {**record, "episodes": 2, "return_mean": return_mean, "bad_physics": bad_physics}
+
+    monkeypatch.setattr(loop, "summarize", summarize)
+    path = tmp_path / "run"
+    train(Config.from_preset("cpu", **TINY, run_dir=str(path)), quiet=True)
+    assert [p.name for p in (path / "best").iterdir()] == ["400"]
 
 
 def test_learning_curve_is_a_png(straight: Outcome) -> None:

@@ -75,6 +75,7 @@ def made_up_records(shift: float = 0.0, ppo: bool = False) -> list[dict[str, obj
                     "kind": "eval", "env_steps": 100 * chunk, "updates": 100 * chunk,
                     "episodes": 2, "return_mean": 9.0 * chunk + shift, "return_std": 1.0,
                     "return_min": 8.0, "return_max": 10.0, "length_mean": 12.0,
+                    "bad_physics": 0,
                 }
             )  # fmt: skip
     return records
