@@ -38,7 +38,7 @@ from diagnosis.table import Runs, rows, table
 from rich.console import Console
 
 from sacformer_jax import CheckpointError, ConfigError
-from sacformer_jax.report.reading import labels
+from sacformer_jax.run_folder import labels
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,6 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"{name}={getattr(args, name)}: must be at least {least}")
     if args.picture is not None and args.picture.suffix != ".png":
         parser.error(f"picture={str(args.picture)!r}: must end in .png")
+    for file in (args.json, args.picture):
+        if file is not None and not file.parent.is_dir():
+            parser.error(f"{file}: there is no folder {file.parent}")
     amounts = Amounts(args.batches, args.episodes, args.windows, args.seed)
     console = Console()
     runs: Runs = {}

@@ -26,7 +26,7 @@ from machine import UNKNOWN, cpu_model
 from study_rows import rows_of
 from study_table import Row, read_table, summary, write_table
 
-from sacformer_jax import Config, resume, train
+from sacformer_jax import Config, ConfigError, resume, train
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.cli import EXIT_INTERRUPTED
 
@@ -108,8 +108,8 @@ class Study:
         for name in names:
             try:
                 changed = self._changed(name)
-            except CheckpointError as error:
-                parser.error(str(error))
+            except (CheckpointError, ConfigError) as error:
+                parser.error(f"{self.runs / name}: {error}")
             if changed:
                 parser.error(
                     f"{self.runs / name} was trained with other settings ({', '.join(changed)}): "

@@ -42,15 +42,19 @@ from sacformer_jax.values import unknown
 
 Setting = dict[str, float]
 
-_NEEDS: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "alpha": ("policy", ("gaussian",)),
-    "alpha_learning_rate": ("tune_alpha", (True,)),
-    "target_entropy": ("tune_alpha", (True,)),
-    "target_return": ("return_conditioning", ("hindsight", "commanded")),
-    "return_scale": ("return_conditioning", ("hindsight", "commanded")),
-    "rtg_discount": ("return_conditioning", ("hindsight",)),
+_Needs = dict[str, tuple[Any, ...]]
+_ENTROPY: _Needs = {"agent": ("sacformer", "sac")}
+_RETURNS: _Needs = {"return_conditioning": ("hindsight", "commanded")}
+_NEEDS: dict[str, _Needs] = {
+    "alpha": {**_ENTROPY, "policy": ("gaussian",)},
+    "alpha_learning_rate": {**_ENTROPY, "tune_alpha": (True,)},
+    "target_entropy": {**_ENTROPY, "tune_alpha": (True,)},
+    "tau": {"agent": ("sacformer", "sac", "td3", "ddpg")},
+    "target_return": _RETURNS,
+    "return_scale": _RETURNS,
+    "rtg_discount": {"return_conditioning": ("hindsight",)},
 }
-"""Settings without any effect unless another one has such a value."""
+"""Settings without any effect unless others have such values."""
 _MAY_DIFFER = {"run_dir", "total_env_steps"}
 """Of a sweep that is gone on with."""
 
@@ -176,10 +180,10 @@ def members_of(settings: Sequence[Setting], config: Config) -> tuple[Member, ...
     """
     flat = config.flat()
     for name in settings[0]:
-        field, good = _NEEDS.get(name, (name, (flat[name],)))
-        if flat[field] not in good:
-            other = " or ".join(map(str, good))
-            raise ConfigError(f"{name}: has no effect with {field}={flat[field]}; use {other}")
+        for field, good in _NEEDS.get(name, {}).items():
+            if flat[field] not in good:
+                other = " or ".join(map(str, good))
+                raise ConfigError(f"{name}: has no effect with {field}={flat[field]}; use {other}")
         if flat[name] == "auto":
             raise ConfigError(f"{name}: cannot be swept with {name}='auto'; give it a number")
     width = max(2, len(str(len(settings))))

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from sacformer_jax import agents
 from sacformer_jax.config import Config, ConfigError
@@ -276,7 +277,9 @@ class Callbacks:
             return
         for callback in self._callbacks:
             try:
-                if call(callback) is False:
+                answer = call(callback)
+                # NumPy's and JAX's False, too, which comparing with a mean of theirs gives.
+                if isinstance(answer, bool | np.bool_ | jax.Array) and not answer:
                     self.stop = True
             except Exception as error:
                 # Kept until the run has been saved.

@@ -166,6 +166,8 @@ class Reporter:
         for column in ("member", "env steps", "return", "std", "best", "at env steps"):
             table.add_column(column, justify="left" if column == "member" else "right")
         for name, records in evaluations.items():
+            if not records:  # lost, and none made since
+                continue
             last, best = records[-1], max(records, key=rank)
             table.add_row(
                 name,

@@ -170,10 +170,11 @@ def _timing_bytes(path: Path, keep_until: int | None) -> int:
 
 
 def read_records(path: Path, kind: str | None = None) -> list[Record]:
-    """The records of a JSONL file, all or of one kind."""
-    with path.open() as lines:
-        records = [json.loads(line) for line in lines]
-    return [record for record in records if kind in (None, record.get("kind"))]
+    """The records of a JSONL file, all or of one kind; none where there is no file.
+
+    A line that is being written, or whose end a crash took, is left out, with all after it.
+    """
+    return [record for record, _ in _records(path) if kind in (None, record.get("kind"))]
 
 
 def rank(evaluation: Record) -> tuple[bool, float]:

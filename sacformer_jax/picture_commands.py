@@ -72,12 +72,14 @@ def render(args: list[str]) -> int:
     """``sacformer render``."""
     from sacformer_jax.model_renderer import View
     from sacformer_jax.policy_renderer import Timing
+    from sacformer_jax.render import check_target
     from sacformer_jax.render import render as draw
     from sacformer_jax.run_folder import RunFolder
 
     parsed = tyro.cli(RenderArgs, args=args, prog="sacformer render")
     view = View(*parse_size(parsed.size), parsed.camera)
     timing = Timing(parsed.fps, parsed.gif_seconds)
+    check_target(parsed.to)
     names = [member.name for member in RunFolder(parsed.run).opened().read_config().members]
     each = parsed.member is None and len(names) > 1
     for member in names if each else [parsed.member]:

@@ -22,7 +22,7 @@ from sacformer_jax.plots import comparison, learning_curve
 from sacformer_jax.policy import Policy, load_policy
 from sacformer_jax.policy_renderer import is_return_conditioned
 from sacformer_jax.recording import Recorder
-from sacformer_jax.run_folder import RunConfigFile, RunFolder
+from sacformer_jax.run_folder import RunConfigFile, RunFolder, labels
 from sacformer_jax.stored import CheckpointError
 from sacformer_jax.train import make_training_env
 
@@ -93,10 +93,12 @@ def draw_records(run: RunRecords, to: Path) -> list[Path]:
         diagnostics_sheet({"": [own]}, folder / "diagnostics.png", title)
         drawn += [folder / "learning_curve.png", folder / "diagnostics.png"]
     if several:
-        comparison(_rows(run, run.run.config.agent), to / "learning_curve.png", run.title)
-        agent = {str(run.run.config.agent): list(run.records.values())}
-        diagnostics_sheet(agent, to / "diagnostics.png", run.title)
-        drawn += [to / "learning_curve.png", to / "diagnostics.png"]
+        label = str(run.run.config.agent)
+        if rows := _rows(run, label):
+            comparison(rows, to / "learning_curve.png", run.title)
+            drawn.append(to / "learning_curve.png")
+        diagnostics_sheet({label: list(run.records.values())}, to / "diagnostics.png", run.title)
+        drawn.append(to / "diagnostics.png")
     return drawn
 
 
@@ -131,6 +133,7 @@ def draw_runs(
 
     Raises:
       CheckpointError: a folder holds no run, or nothing to draw yet.
+      ConfigError: one was given twice.
     """
     runs = [read_run(path) for path in paths]
     if len(runs) > 1:
@@ -152,8 +155,9 @@ def _compare(runs: list[RunRecords], to: Path) -> Iterator[Path]:
     labels = _labels(runs)
     rows = [row for run, label in zip(runs, labels, strict=True) for row in _rows(run, label)]
     title = " and ".join(dict.fromkeys(run.run.config.task.env for run in runs))
-    comparison(rows, to / "comparison.png", "evaluations")
-    yield to / "comparison.png"
+    if rows:
+        comparison(rows, to / "comparison.png", "evaluations")
+        yield to / "comparison.png"
     groups = {label: list(run.records.values()) for run, label in zip(runs, labels, strict=True)}
     diagnostics_sheet(groups, to / "diagnostics.png", title)
     yield to / "diagnostics.png"
@@ -164,10 +168,7 @@ def _labels(runs: list[RunRecords]) -> list[str]:
     by_agent = [run.run.config.agent for run in runs]
     if len(set(by_agent)) == len(runs):
         return [str(agent) for agent in by_agent]
-    names = [run.folder.path.name for run in runs]
-    if len(set(names)) == len(runs):
-        return names
-    return [f"{run.folder.path.parent.name}/{name}" for run, name in zip(runs, names, strict=True)]
+    return labels([run.folder.path for run in runs])
 
 
 # --- what a policy does --------------------------------------------------------------------------

@@ -57,8 +57,7 @@ def render(
         raise ConfigError(f"episodes={episodes}: must be at least 1")
     if not 0 <= seed < 2**32:
         raise ConfigError(f"seed={seed}: must be at least 0 and below 2**32")
-    if to is not None and Path(to).suffix not in ("", *VIDEO_SUFFIXES, HTML_SUFFIX):
-        raise ConfigError(f"to={str(to)!r}: must end in .mp4, .gif, .html or in no suffix")
+    check_target(to)
     loaded = load_policy(run, policy, member)
     to = Path(to) if to is not None else _member_folder(run, member) / "videos" / policy
     with PolicyRenderer(loaded, episodes, view) as renderer:
@@ -67,6 +66,20 @@ def render(
             page = (HTML_SUFFIX,) if hasattr(renderer.source, "html") else ()
             paths = [to.with_name(to.name + suffix) for suffix in (*VIDEO_SUFFIXES, *page)]
         return renderer.render(loaded, seed, paths, timing or Timing())
+
+
+def check_target(to: str | Path | None) -> None:
+    """Refuses a file that no video can be written to.
+
+    Raises:
+      ConfigError: another suffix, or a folder.
+    """
+    if to is None:
+        return
+    if Path(to).suffix not in ("", *VIDEO_SUFFIXES, HTML_SUFFIX):
+        raise ConfigError(f"to={str(to)!r}: must end in .mp4, .gif, .html or in no suffix")
+    if Path(to).is_dir():
+        raise ConfigError(f"to={str(to)!r}: is a folder; give a file in it")
 
 
 def check_drawable(env: Env) -> None:

@@ -19,11 +19,12 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sacformer_jax import processes, stored
-from sacformer_jax.config import Config
+from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.members import Member
 from sacformer_jax.restoring import Restored, restore_newest
@@ -208,3 +209,20 @@ def _write_whole(path: Path, text: str) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(new, path)
+
+
+def labels(paths: Sequence[str | Path]) -> list[str]:
+    """A short name for each run's folder, unique among them: its last part, or more where needed.
+
+    Raises:
+      ConfigError: one was given twice.
+    """
+    folders = [RunFolder(path).path for path in paths]
+    twice = [str(folder) for folder in folders if folders.count(folder) > 1]
+    if twice:
+        raise ConfigError(f"runs: {twice[0]!r} was given twice")
+    names, length = [folder.name for folder in folders], 1
+    while len(set(names)) < len(names):
+        length += 1
+        names = ["/".join(folder.parts[1:][-length:]) for folder in folders]
+    return names

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sacformer_jax import (
@@ -23,6 +26,7 @@ from sacformer_jax import (
     resume,
     train,
 )
+from sacformer_jax.callbacks import Callbacks
 from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
 from sacformer_jax.run_folder import RunFolder
@@ -181,6 +185,22 @@ def test_false_stops_the_run_and_it_goes_on_as_if_nothing_had_been(
         assert digest(ends[0]) == digest(ends[1])
         metrics = [(run / name / "metrics.jsonl") for run in (path, watched.result.path)]
         assert metrics[0].read_bytes() == metrics[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("answer", "stops"),
+    [
+        (False, True), (np.float64(1) > 2, True), (jnp.array(1) > 2, True), (True, False),
+        (np.True_, False), (None, False), (0, False), ("", False),
+    ],
+)  # fmt: skip
+def test_only_false_stops(answer: Any, stops: bool) -> None:
+    no_population: Any = None
+    state: Any = SimpleNamespace(counters=SimpleNamespace(env_steps=0))
+    callbacks = Callbacks([At(0, lambda: answer)], no_population, Path())
+    callbacks.chunk(state, {}, {})
+    assert callbacks.stop is stops
+    callbacks.raise_error()
 
 
 def test_an_error_ends_the_run_after_it_was_saved(tmp_path: Path) -> None:

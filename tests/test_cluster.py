@@ -49,6 +49,15 @@ def test_afterwards_it_resumes_and_goes_back_into_the_queue_only_if_it_was_stopp
     assert calls == [f"srun sacformer resume {run} --distributed", *again]
 
 
+def test_resuming_lies_on_the_same_devices(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    flags = ("--seeds", "2", "--data-devices", "4", "--env", "Ant", "--seed_devices=2")
+    _, calls = _submitted(tmp_path, run, 0, *flags)
+    assert calls == [f"srun sacformer resume {run} --data-devices 4 --seed_devices=2 --distributed"]
+
+
 def test_it_asks_for_a_folder(tmp_path: Path) -> None:
     code, said = _submitted(tmp_path, None, 0)
     assert code != 0

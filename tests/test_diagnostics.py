@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from untrained import STEPS, made_up_records, untrained_run
+from untrained import STEPS, made_up_records, untrained_config, untrained_run
 
-from sacformer_jax import evaluate, load_policy
+from sacformer_jax import ConfigError, evaluate, load_policy
 from sacformer_jax.attention import acting_attention
 from sacformer_jax.cli import main
+from sacformer_jax.console import Reporter
 from sacformer_jax.diagnostics import PANELS, _curve, attention_map, diagnostics_sheet
 from sacformer_jax.distributions import TanhGaussian
 from sacformer_jax.networks import STEP_TOKENS
-from sacformer_jax.pictures import TARGETS, mean_attention, returns_for_targets
+from sacformer_jax.pictures import (
+    TARGETS,
+    RunRecords,
+    _labels,
+    mean_attention,
+    returns_for_targets,
+)
 from sacformer_jax.recording import Recorder
+from sacformer_jax.run_folder import RunConfigFile, RunFolder
 from sacformer_jax.train import make_training_env
 from sacformer_jax.transformer import Transformer, TransformerConfig
 
@@ -206,6 +215,39 @@ def test_plot_of_several_members_and_runs(run: Path, tmp_path: Path, capsys) -> 
     said = capsys.readouterr().out.split()
     assert said == [str(to / "comparison.png"), str(to / "diagnostics.png")]
     assert sorted(map(str, to.iterdir())) == said
+
+
+def test_plot_before_the_first_evaluation(tmp_path: Path, capsys) -> None:
+    path = untrained_run(tmp_path / "sac", seeds=2, agent="sac")
+    for seed in range(2):
+        metrics = path / f"seed-{seed}" / "metrics.jsonl"
+        lines = [r for r in made_up_records(seed) if r["kind"] == "train"]
+        metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert main(["plot", str(path)]) == 0
+    assert [p.name for p in path.glob("*.png")] == ["diagnostics.png"]
+    other = untrained_run(tmp_path / "other", agent="td3")
+    assert main(["plot", str(path), str(other), "--to", str(tmp_path / "both")]) == 0
+    with Reporter(quiet=True) as reporter:
+        reporter._last_evaluations({"seed-0": [], "seed-1": []})
+
+
+def test_runs_of_the_same_name_are_told_apart() -> None:
+    config = untrained_config(agent="sac")
+    runs = [
+        RunRecords(RunFolder(path), RunConfigFile(config, {}, ()), {})
+        for path in ("/a/runs/x", "/b/runs/x")
+    ]
+    assert _labels(runs) == ["a/runs/x", "b/runs/x"]
+    with pytest.raises(ConfigError, match="'/a/runs/x' was given twice"):
+        _labels([runs[0], runs[0]])
+
+
+def test_a_place_that_cannot_be_written_is_told_in_a_line(
+    run: Path, tmp_path: Path, capsys
+) -> None:
+    (tmp_path / "file").write_text("here already")
+    assert main(["plot", str(run), "--to", str(tmp_path / "file"), "--episodes", "0"]) == 2
+    assert f"error: '{tmp_path / 'file'}': File exists" in capsys.readouterr().err
 
 
 def test_plot_refuses_what_has_nothing_to_draw(run: Path, tmp_path: Path, capsys) -> None:

@@ -232,6 +232,25 @@ def test_scores_at_equal_wall_clock(tmp_path: Path) -> None:
     assert "wall-clock" not in (tmp_path / "figure2-cpu.md").read_text()
 
 
+def test_a_longer_beginning_is_free(tmp_path: Path) -> None:
+    runs = {
+        "Hopper-sac": [returns_for("Hopper", *[0.5] * 8)] * 2,
+        "Hopper-sacformer": [returns_for("Hopper", *[0.0] * 4, 1.0, 1.0, 1.0, 1.0)] * 2,
+    }
+    study = read(tmp_path / "a.csv", runs, seconds={"Hopper-sacformer": 3.5, "Hopper-sac": 0.5})
+    own = study.lines["Hopper", "sacformer"]
+    # As if it had begun to learn after the fourth evaluation: its first is at 4,000 steps.
+    own.__dict__.pop("steps", None)
+    for curve in own.curves.values():
+        for step in (1_000, 2_000, 3_000):
+            del curve[step]
+    assert own.steps[0] == 4_000
+    (one,) = timed(study, "sac")
+    # A seventh of SAC's 7,000 steps after its first evaluation: 4,000 and 5,000 are counted.
+    assert one.slowdown == pytest.approx(7.0)
+    assert one.difference.value == pytest.approx((0.0 + 1.0) / 2 - 0.5)
+
+
 def test_a_run_that_was_held_up_is_no_slower(tmp_path: Path) -> None:
     study = read(tmp_path / "arena.csv", {"Hopper-sac": [[0.0, 1, 2, 3, 4]] * 2})
     line, program = study.lines["Hopper", "sac"], Program("A", 2)
@@ -344,6 +363,18 @@ def test_intervals_are_sorted(tmp_path: Path) -> None:
     assert list(best[1]) == pytest.approx([np.mean(score)])
     points = [line.get_xdata()[0] for line in right.lines if line.get_marker() == "o"]
     assert points == [1.0] * 7
+
+
+def test_the_caption_tells_which_tasks_are_compared(tmp_path: Path) -> None:
+    both = [returns_for("Hopper", 0.5), returns_for("Hopper", 0.6)]
+    other = [returns_for("Walker2d", 0.5), returns_for("Walker2d", 0.6)]
+    runs = {f"Hopper-{name}": both for name in MANY}
+    runs |= {f"Walker2d-{name}": other for name in MANY if name != "sacformer"}
+    study = read(tmp_path / "ablations.csv", runs, agent="sacformer")
+    caption = caption_of(intervals_figure(study, aggregates(study, "sacformer"), "sacformer"))
+    assert "no worse than SACFormer. " in caption  # it is not shown, so nothing is hollow
+    assert caption.count(": on Hopper only.") == 1
+    assert "Left out, not finished: SACFormer." in caption
 
 
 def test_files_are_the_same_every_time_and_made_without_jax(tmp_path: Path) -> None:

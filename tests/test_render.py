@@ -300,6 +300,7 @@ def test_brax_makes_a_page_and_is_drawn() -> None:
         (["--gif-seconds", "-1"], "gif_seconds=-1.0"),
         (["--seed", "-1"], "seed=-1"),
         (["--to", "a.avi"], "must end in .mp4"),
+        (["--to", "."], "to='.': is a folder"),
         (["--to", "a.html"], "brax's viewer makes HTML"),
         (["--member", "7"], "member='7'"),
         (["--policy", "latest"], "no latest policy yet"),

@@ -16,10 +16,10 @@ import pytest
 
 from sacformer_jax import CheckpointError, Config, ConfigError, cli, report
 from sacformer_jax.envs import EnvSpec
-from sacformer_jax.logging import Record
+from sacformer_jax.logging import Record, read_records
 from sacformer_jax.members import seed_members
-from sacformer_jax.report.reading import labels, read_run
-from sacformer_jax.run_folder import RunFolder
+from sacformer_jax.report.reading import read_run
+from sacformer_jax.run_folder import RunFolder, labels
 from sacformer_jax.runner import sources_of
 
 SPEC = EnvSpec("Hopper", 11, 3, (-1.0,) * 3, (1.0,) * 3, 1000, "native", "a test")
@@ -135,13 +135,19 @@ def test_members_are_compared_where_all_were_evaluated(tmp_path: Path) -> None:
 def test_a_line_being_written_is_left_out(tmp_path: Path) -> None:
     folder = _run(tmp_path / "run")
     path = folder.metrics_path("seed-0")
-    path.write_text(path.read_text() + '{"kind": "eval", "env_st')
+    whole = path.read_text()
+    for end in ('{"kind": "eval", "env_st', "\0\0\0", "\0\0\0\n"):  # or lost in a power cut
+        path.write_text(whole + end)
+        assert read_records(path)[-1]["env_steps"] == 3_000
     assert read_run(folder.path, "run").env_steps == 3_000
 
 
 def test_labels_are_as_short_as_they_can_be() -> None:
     assert labels(["/a/x", "/a/y"]) == ["x", "y"]
     assert labels(["/a/b/x", "/a/c/x"]) == ["b/x", "c/x"]
+    assert labels(["/a/x", "/x"]) == ["a/x", "x"]
+    with pytest.raises(ConfigError, match="'/a/x' was given twice"):
+        labels(["/a/x", "/a/y", "/a/x"])
 
 
 # --- the page ------------------------------------------------------------------------------------

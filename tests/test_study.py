@@ -192,6 +192,24 @@ def test_an_unknown_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "Hopper-7" in capsys.readouterr().err
 
 
+def test_a_folder_of_another_version_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study = _study(tmp_path)
+    _pretend(study, "Hopper-b", [1.0], [2.0])
+    path = study.runs / "Hopper-b" / "config.json"
+    contents = json.loads(path.read_text())
+    contents["config"]["context"]["taken_out"] = 1
+    path.write_text(json.dumps(contents))
+    monkeypatch.setattr(RunFolder, "latest_step", lambda folder: 100)
+    with pytest.raises(SystemExit) as refused:
+        study.main(["--only", "Hopper-b"])
+    assert refused.value.code == 2
+    said = capsys.readouterr().err
+    assert str(path.parent) in said
+    assert "taken_out" in said
+
+
 SCRIPTS = ("figure2", "figure3", "ablations")
 
 

@@ -134,6 +134,12 @@ def test_every_setting_has_a_member_for_each_seed() -> None:
         ({}, {"actor_learning_rate": 0.0}, "actor_learning_rate=0.0: must be greater than 0"),
         ({"tune_alpha": False}, {"target_entropy": -1.0}, "target_entropy: .*tune_alpha=False"),
         ({}, {"target_return": 10.0}, "target_return: .*return_conditioning=none"),
+        ({"agent": "td3"}, {"alpha": 0.1}, "alpha: has no effect with agent=td3"),
+        (
+            {"agent": "ppo", "prefill_env_steps": 0},
+            {"tau": 0.1},
+            "tau: has no effect with agent=ppo",
+        ),
         (
             {"agent": "sacformer", "target_return": "auto"},
             {"target_return": 10.0},

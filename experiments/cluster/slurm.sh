@@ -23,8 +23,19 @@ set -uo pipefail
 SACFORMER=${SACFORMER:-sacformer}
 STOPPED_AFTER_SAVING=3
 
+# How a run lies on devices is no part of it, so resuming is told again.
+devices=() before=""
+for flag in "$@"; do
+    case $flag in
+        --seed[-_]devices=* | --data[-_]devices=*) devices+=("$flag") ;;
+    esac
+    case $before in
+        --seed[-_]devices | --data[-_]devices) devices+=("$before" "$flag") ;;
+    esac
+    before=$flag
+done
 if [[ -f $RUN/config.json ]]; then
-    command=(resume "$RUN")
+    command=(resume "$RUN" "${devices[@]}")
 else
     command=(train --run-dir "$RUN" "$@")
 fi

@@ -68,12 +68,24 @@ def _interval(axes: Axes, place: int, estimate: Estimate, hollow: bool) -> None:
     )  # fmt: skip
 
 
+def _on_fewer_tasks(study: StudyLines, made: Sequence[Aggregate]) -> dict[str, list[str]]:
+    """Which of those shown are compared with the baseline on how few tasks."""
+    of: dict[str, list[str]] = {}
+    for one in made:
+        if one.iqm is not None and one.improvement is not None and one.tasks != study.tasks:
+            of.setdefault(", ".join(one.tasks), []).append(label_of(one.variant))
+    return of
+
+
 def _caption(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str:
     text = (
         f"Study {study.name}: {facts(study)}. Scores: mean of a run's last {LAST_EVALUATIONS} "
         f"evaluations on {', '.join(rated_tasks(study))}, where 0 is random actions and 1 "
         f"{REFERENCE_SOURCE}. Lines: 95 % stratified bootstrap intervals; dashed: no better and no "
-        f"worse than {label_of(baseline)} (hollow)."
+        f"worse than {label_of(baseline)}"
     )
     missing = [label_of(one.variant) for one in made if one.iqm is None]
+    text += "." if label_of(baseline) in missing else " (hollow)."
+    for tasks, of in _on_fewer_tasks(study, made).items():
+        text += f" Improvement of {', '.join(of)}: on {tasks} only."
     return text + (f" Left out, not finished: {', '.join(missing)}." if missing else "")

@@ -63,7 +63,7 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
                 continue
             tasks.append(task)
             slowdowns.append(slowdown)
-            of.append(normalized(task, scores_until(own, _steps_for(base, slowdown))))
+            of.append(normalized(task, scores_until(own, _steps_for(own, base, slowdown))))
             over.append(normalized(task, base.scores))
         if tasks:
             difference = iqm_difference(of, over)
@@ -106,7 +106,6 @@ def scores_until(line: Line, limit: float) -> np.ndarray:
     return run_scores(line.returns_at(within).T)
 
 
-def _steps_for(base: Line, slowdown: float) -> float:
+def _steps_for(own: Line, base: Line, slowdown: float) -> float:
     """Env steps in the baseline's time. Those to the first evaluation are random, and free."""
-    first = float(base.steps[0])
-    return first + (base.last_step - first) / slowdown
+    return float(own.steps[0]) + (base.last_step - float(base.steps[0])) / slowdown

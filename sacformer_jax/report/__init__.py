@@ -11,7 +11,8 @@ from pathlib import Path
 
 from sacformer_jax.config import ConfigError
 from sacformer_jax.report.page import html_page
-from sacformer_jax.report.reading import labels, read_run
+from sacformer_jax.report.reading import read_run
+from sacformer_jax.run_folder import labels
 
 
 def report(runs: Sequence[str | Path], to: str | Path | None = None) -> Path:
@@ -30,12 +31,8 @@ def report(runs: Sequence[str | Path], to: str | Path | None = None) -> Path:
     """
     if not runs:
         raise ConfigError("runs=(): give the folder of at least one run")
-    absolute = [Path(run).expanduser().absolute() for run in runs]
-    twice = [str(path) for path in absolute if absolute.count(path) > 1]
-    if twice:
-        raise ConfigError(f"runs: {twice[0]!r} was given twice")
-    read = [read_run(path, label) for path, label in zip(absolute, labels(absolute), strict=True)]
-    default = absolute[0] / "report.html" if len(read) == 1 else Path("report.html")
+    read = [read_run(path, label) for path, label in zip(runs, labels(runs), strict=True)]
+    default = read[0].path / "report.html" if len(read) == 1 else Path("report.html")
     path = Path(to) if to is not None else default
     try:
         path.write_text(html_page(read))

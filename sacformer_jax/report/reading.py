@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sacformer_jax.config import Config
-from sacformer_jax.logging import Record
+from sacformer_jax.logging import Record, read_records
 from sacformer_jax.run_folder import RunFolder
 
 RESAMPLES = 2_000
@@ -163,14 +162,17 @@ def read_run(path: str | Path, label: str) -> Run:
     """
     folder = RunFolder(path).opened()
     known, spec = folder.read_config(), folder.read_spec()
-    metrics = {member.name: _records(folder.metrics_path(member.name)) for member in known.members}
+    metrics = {
+        member.name: read_records(folder.metrics_path(member.name)) for member in known.members
+    }
     by_kind = {
         kind: {
             name: [record for record in records if record["kind"] == kind]
             for name, records in metrics.items()
         }
-        for kind in ("train", "eval")
+        for kind in ("train", "eval", "pretrain")
     }
+    learning = [*by_kind["train"].values(), *by_kind["pretrain"].values()]
     return Run(
         label=label,
         path=folder.path,
@@ -180,33 +182,15 @@ def read_run(path: str | Path, label: str) -> Run:
         engine=spec.engine,
         train=by_kind["train"],
         evaluations=by_kind["eval"],
-        timings=_records(folder.timings_path),
-        faults=_faults(folder, list(metrics), by_kind["train"]),
+        timings=read_records(folder.timings_path),
+        faults=_faults(folder, list(metrics), learning),
         video=_newest_video(folder.path),
     )
 
 
-def labels(paths: Sequence[str | Path]) -> list[str]:
-    """A short name for each folder, unique among them: its last part, or more where needed."""
-    parts = [RunFolder(path).path.parts for path in paths]
-    for length in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(own[-length:]) for own in parts]
-        if len(set(names)) == len(names):
-            return names
-    return ["/".join(own) for own in parts]
-
-
-def _records(path: Path) -> list[Record]:
-    """Whole lines only: the last one may be half written."""
-    if not path.exists():
-        return []
-    lines = path.read_text().splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("\n")]
-
-
-def _faults(folder: RunFolder, names: list[str], train: dict[str, list[Record]]) -> Faults:
+def _faults(folder: RunFolder, names: list[str], learning: list[list[Record]]) -> Faults:
     def total(name: str) -> int:
-        return sum(record.get(name) or 0 for records in train.values() for record in records)
+        return sum(record.get(name) or 0 for records in learning for record in records)
 
     given_up = {}
     for name in names:
