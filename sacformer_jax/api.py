@@ -11,12 +11,15 @@ from sacformer_jax.collecting import make_collector
 from sacformer_jax.config import ConfigError
 from sacformer_jax.datasets import check_dataset_id, write_episodes
 from sacformer_jax.evaluate import make_evaluator
+from sacformer_jax.offline import Episode
 from sacformer_jax.policy import load_policy
 from sacformer_jax.train import make_training_env
 from sacformer_jax.types import Acted, Context
 
 _SIDE_BY_SIDE = 16
 """Environments in which episodes are collected."""
+_MOST_TRIES = 10
+"""Episodes collected at most for each that is asked for, where physics breaks down."""
 
 
 def evaluate(
@@ -102,9 +105,16 @@ def collect(
         return agent.act(loaded.state, context, key, explore=actions == "sample")
 
     collect_turn = make_collector(env, choose, context_length, agent.init_cache(env.num_envs))
-    key, found = jax.random.key(seed), []
-    for turn in range(-(-episodes // env.num_envs)):
+    key, turn = jax.random.key(seed), 0
+    found: list[Episode] = []
+    while len(found) < episodes:
+        if turn * env.num_envs > _MOST_TRIES * episodes:
+            raise ConfigError(
+                f"episodes={episodes}: of {turn * env.num_envs} only {len(found)} were whole, in "
+                "the others the physics broke down; ask for fewer, or another policy"
+            )
         found += collect_turn(jax.random.fold_in(key, turn))
+        turn += 1
     who = "random actions" if actions == "random" else f"{loaded.config.agent}, {actions} actions"
     return write_episodes(
         found[:episodes], to, env.spec, who, f"{who} in {env.spec.name}, engine {env.spec.engine}"

@@ -9,13 +9,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import parse_env_id
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.envs import gym_wrappers
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.envs.gym_registry import registered
 from sacformer_jax.envs.gym_wrappers import gym_wrapped_spec
 from sacformer_jax.offline import Episode
 from sacformer_jax.values import first_line
+
+_WRAPPERS = gym_wrappers.__name__
 
 
 def minari_or_refuse(what: str) -> Any:
@@ -44,20 +48,52 @@ def read_episodes(dataset: str) -> list[Episode]:
       ConfigError: Minari is not installed, there is no such dataset, or its observations or
         actions are not plain vectors.
     """
-    what = f"dataset={dataset!r}"
-    minari = minari_or_refuse(what)
-    try:
-        found = _opened(minari, dataset)
-    except (FileNotFoundError, ValueError, OSError, KeyError) as error:
-        raise ConfigError(
-            f"{what}: is no local Minari dataset ({first_line(error)}); give an id that "
-            "'minari list local' shows (get one by 'minari download'), or its folder"
-        ) from error
+    what, found = f"dataset={dataset!r}", _found(dataset)
     for name in ("observation", "action"):
         space = getattr(found.spec, f"{name}_space")
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             raise ConfigError(f"{what}: its {name}s are {space}; they must be vectors (a 1-D Box)")
     return [_episode(episode) for episode in found.iterate_episodes()]
+
+
+def check_source(dataset: str, spec: EnvSpec) -> None:
+    """Refuses a dataset that says it is of another task, or of a task wrapped by us.
+
+    Args:
+      dataset: as of :func:`read_episodes`.
+      spec: of the environment that is to be learnt in.
+
+    Raises:
+      ConfigError: it does; or as :func:`read_episodes`. A dataset that does not say is believed.
+    """
+    source = _found(dataset).spec.env_spec
+    if source is None:
+        return
+    ours = [each for each in source.additional_wrappers if each.entry_point.startswith(_WRAPPERS)]
+    if ours:
+        raise ConfigError(
+            f"dataset={dataset!r}: was collected with {ours[0].name}, so its steps are not those "
+            f"of env={spec.name!r}; collect one without"
+        )
+    name = parse_env_id(source.id)[1]
+    is_a_task = spec.gymnasium_id is not None and parse_env_id(spec.gymnasium_id)[1] == spec.name
+    if is_a_task and name != spec.name:
+        raise ConfigError(
+            f"dataset={dataset!r}: is of {source.id}, not of env={spec.name!r}; use one of that "
+            f"task, or env={name}"
+        )
+
+
+def _found(dataset: str) -> Any:
+    what = f"dataset={dataset!r}"
+    minari = minari_or_refuse(what)
+    try:
+        return _opened(minari, dataset)
+    except (FileNotFoundError, ValueError, OSError, KeyError) as error:
+        raise ConfigError(
+            f"{what}: is no local Minari dataset ({first_line(error)}); give an id that "
+            "'minari list local' shows (get one by 'minari download'), or its folder"
+        ) from error
 
 
 def _opened(minari: Any, dataset: str) -> Any:

@@ -88,7 +88,8 @@ class EngineFrames:
         if self._native:
             return state
         # Of a planar task the second coordinate is the height, and the origin's is 0.
-        return state.qpos.at[:2].add(state.origin)
+        root = min(2, state.qpos.shape[0])
+        return state.qpos.at[:root].add(state.origin[:root])
 
     def draw(self, snapshot: Any) -> np.ndarray:
         if self._native:

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax.config import ConfigError
+from sacformer_jax.envs.gym_registry import registered, reward_terms, time_limit
 from sacformer_jax.envs.gym_wrappers import gym_wrapped
 from sacformer_jax.envs.models import loading_quietly
 from sacformer_jax.envs.wrapping import UNWRAPPED, Wrapping
@@ -60,18 +61,19 @@ def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEv
     def predict(obs: Any, state: Any, reward: float | None) -> tuple[np.ndarray, Any]:
         return policy.predict(obs, state, reward=reward)
 
-    env_id, wrapping = gymnasium_id(policy), policy.spec.wrapping
-    return _run(env_id, wrapping, episodes, seed, predict)
+    with contextlib.closing(gymnasium_env(policy)) as env:
+        return _run(gymnasium_id(policy), env, episodes, seed, predict)
 
 
 def evaluate_random(
     env_id: str, episodes: int, seed: int = 0, wrapping: Wrapping = UNWRAPPED
 ) -> GymnasiumEvaluation:
     """The same with uniformly random actions."""
-    with contextlib.closing(_made(env_id, wrapping)) as env:
+    limit = time_limit(registered(env_id))
+    with contextlib.closing(_made(env_id, wrapping, limit)) as env:
         space = env.action_space
-    space.seed(seed)
-    return _run(env_id, wrapping, episodes, seed, lambda obs, state, reward: (space.sample(), None))
+        space.seed(seed)
+        return _run(env_id, env, episodes, seed, lambda obs, state, reward: (space.sample(), None))
 
 
 def gymnasium_id(policy: Policy) -> str:
@@ -90,31 +92,41 @@ def gymnasium_id(policy: Policy) -> str:
 def gymnasium_env(policy: Policy, **settings: Any) -> gymnasium.Env:
     """The Gymnasium environment that a policy acts in: its task, with the wrappers of training.
 
+    An id that is registered without a time limit gets that of training.
+
     Args:
       policy: the policy.
       **settings: for ``gymnasium.make``, e.g. ``render_mode="human"``.
 
     Raises:
-      ConfigError: its task is none of Gymnasium's.
+      ConfigError: its task is none of Gymnasium's, or cannot be made here.
     """
-    return _made(gymnasium_id(policy), policy.spec.wrapping, **settings)
+    limit = policy.spec.max_episode_steps
+    return _made(gymnasium_id(policy), policy.spec.wrapping, limit, **settings)
 
 
-def _made(env_id: str, wrapping: Wrapping, **settings: Any) -> gymnasium.Env:
-    with loading_quietly():
-        return gym_wrapped(gymnasium.make(env_id, **settings), wrapping)
+def _made(env_id: str, wrapping: Wrapping, limit: int, **settings: Any) -> gymnasium.Env:
+    """``limit`` is for ids that have none."""
+    if registered(env_id).max_episode_steps is None:
+        settings = {"max_episode_steps": limit, **settings}
+    try:
+        with loading_quietly():
+            return gym_wrapped(gymnasium.make(env_id, **settings), wrapping)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ConfigError(
+            f"env={env_id!r}: Gymnasium cannot make it: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _run(
     env_id: str,
-    wrapping: Wrapping,
+    env: gymnasium.Env,
     episodes: int,
     seed: int,
     predict: Callable[[Any, Any, float | None], tuple[np.ndarray, Any]],
 ) -> GymnasiumEvaluation:
     if episodes < 1:
         raise ConfigError(f"episodes={episodes}: must be at least 1")
-    env = _made(env_id, wrapping)
     returns, lengths = np.zeros(episodes), np.zeros(episodes, int)
     terms: dict[str, float] = {}
     for episode in range(episodes):
@@ -128,11 +140,9 @@ def _run(
             reward = float(step_reward)
             returns[episode] += reward
             lengths[episode] += 1
-            for name, value in info.items():
-                if name.startswith("reward_"):
-                    terms[name] = terms.get(name, 0.0) + float(value)
+            for name, value in reward_terms(info).items():
+                terms[name] = terms.get(name, 0.0) + value
             done = terminated or truncated
-    env.close()
     steps = int(lengths.sum())
     return GymnasiumEvaluation(
         env=env_id,

@@ -15,7 +15,7 @@ from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
 from sacformer_jax.cores import xla_threads
-from sacformer_jax.datasets import described, read_episodes
+from sacformer_jax.datasets import check_source, described, read_episodes
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
 from sacformer_jax.logging import read_records, write_csv
@@ -187,6 +187,7 @@ def dataset_of(population: Population) -> list[Episode]:
             f"dataset={config.offline.dataset!r}: can be read by one process only; start it in "
             "one, and resume in several"
         )
+    check_source(config.offline.dataset, population.program.env.spec)
     episodes = read_episodes(config.offline.dataset)
     check_episodes(episodes, population.program.env.spec, config)
     return episodes

@@ -80,8 +80,17 @@ class BreakingEnv(PointEnv):
         return (point, count + 1), step
 
 
-def test_bad_physics_ends_the_episode_without_a_trace_in_the_values():
-    env = as_brax(BreakingEnv())
+class ForgetfulEnv(BreakingEnv):
+    """The same, and does not say so."""
+
+    def step(self, state, action):
+        state, step = super().step(state, action)
+        return state, dataclasses.replace(step, bad=jnp.zeros((), bool))
+
+
+@pytest.mark.parametrize("breaking", [BreakingEnv, ForgetfulEnv])
+def test_bad_physics_ends_the_episode_without_a_trace_in_the_values(breaking):
+    env = as_brax(breaking())
     state = env.reset(jax.random.key(0))
     for count in range(3):
         before, state = state, env.step(state, jnp.ones(1))

@@ -16,6 +16,7 @@ from probe import EPISODE, PointEnv, point_config
 from sacformer_jax import (
     Config,
     ConfigError,
+    api,
     collect,
     load_policy,
     make_population,
@@ -25,10 +26,10 @@ from sacformer_jax import (
 )
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.collecting import make_collector
-from sacformer_jax.datasets import read_episodes
+from sacformer_jax.datasets import check_source, read_episodes, write_episodes
 from sacformer_jax.digests import digest
 from sacformer_jax.distributions import NoisyPoint, TanhGaussian
-from sacformer_jax.envs import VectorEnv, make_env
+from sacformer_jax.envs import VectorEnv, make_env, wrapped
 from sacformer_jax.logging import read_records
 from sacformer_jax.offline import Episode, check_episodes, lay_out, with_dataset
 from sacformer_jax.run_folder import RunFolder
@@ -399,6 +400,37 @@ def test_a_dataset_that_is_not_there_is_refused_before_anything_is_written(tmp_p
     with pytest.raises(ConfigError, match="is no local Minari dataset"):
         train(config, quiet=True)
     assert not (tmp_path / "r").exists()
+
+
+def test_a_dataset_of_another_task_is_refused(dataset: Path) -> None:
+    hopper = make_env("Hopper")
+    check_source(str(dataset), hopper.spec)
+    with pytest.raises(ConfigError, match=r"is of Hopper-v5, not of env='Walker2d'.* env=Hopper"):
+        check_source(str(dataset), make_env("Walker2d").spec)
+    delayed = wrapped(hopper, action_delay=2).spec
+    episodes = read_episodes(str(dataset))[:1]
+    write_episodes(episodes, "test/delayed-v0", delayed, "nobody", "as if delayed")
+    with pytest.raises(ConfigError, match=r"was collected with ActionDelay, .*env='Hopper'"):
+        check_source("test/delayed-v0", hopper.spec)
+
+
+@pytest.mark.parametrize("whole", [0, 3])
+def test_collecting_goes_on_until_there_are_enough_or_says_that_there_are_not(
+    run: Path, whole: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turns = []
+
+    def broken(*_: Any) -> Any:  # of each turn so many are whole
+        return lambda key: turns.append(key) or [turns[-1]] * whole
+
+    monkeypatch.setattr(api, "make_collector", broken)
+    monkeypatch.setattr(api, "write_episodes", lambda episodes, *_: len(episodes))
+    if whole:
+        assert collect(run, "test/few-v0", episodes=20) == 20
+        assert len(turns) == 7
+    else:
+        with pytest.raises(ConfigError, match="episodes=20: of 208 only 0 were whole"):
+            collect(run, "test/few-v0", episodes=20)
 
 
 @pytest.mark.parametrize(

@@ -214,16 +214,20 @@ def test_engines_agree_on_activations_free_bodies_and_all_quantities(integrator)
 
 
 def test_where_the_root_is_recentred_positions_are_the_worlds():
-    """A cart far out: what is derived moves with it, on mjx as on native, and so does its speed."""
+    """A cart far out: what is derived moves with it, on mjx as on native, and so does its speed,
+    and what is the world's stays.
+    """
     cart = joint_model().replace('axis="0 1 0"', 'type="slide" axis="1 0 0"')
+    cart = cart.replace("<worldbody>", '<worldbody><site pos="3 0 1"/>')
+    derived = ("xpos", "xipos", "subtree_com", "geom_xpos", "site_xpos")
 
     def observe(q):
-        return jnp.concatenate([q.qpos, q.qvel, *(q.derived[n][-1] for n in ("xpos", "geom_xpos"))])
+        return jnp.concatenate([q.qpos, q.qvel, *(q.derived[name].ravel() for name in derived)])
 
     task = hinge(
         xml_file=cart.replace("<geom", '<geom mass=".02"'),
         observe=observe,
-        derived=("xpos", "geom_xpos"),
+        derived=derived,
         reset=lambda key, start: start.replace(qpos=jnp.array([500.0])),
         frame_skip=2,
         recentre_root=True,
@@ -276,6 +280,17 @@ def test_mjx_takes_the_models_solver_and_few_iterations_of_its_own():
 def test_what_cannot_be_is_refused_with_the_tasks_name_and_the_remedy(fields, message):
     with pytest.raises(ConfigError, match=message):
         make_env(hinge(**fields), "native")
+
+
+def test_mjx_refuses_delays_of_the_model():
+    delayed = joint_model('<motor joint="j" ctrlrange="-1 1" delay="0.02" nsample="4"/>')
+    try:
+        task = hinge(xml_file=delayed)
+        make_env(task, "native")
+    except ConfigError as error:  # MuJoCo from before there were delays
+        pytest.skip(str(error))
+    with pytest.raises(ConfigError, match=r"'Hinge': its model delays .*use engine=native"):
+        make_env(task, "mjx")
 
 
 def test_mjx_says_what_it_cannot_run():

@@ -8,6 +8,8 @@ import re
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import imageio.v2
 import jax
@@ -167,6 +169,12 @@ def test_long_captions_are_made_smaller() -> None:
 )
 def test_steps_that_are_drawn(length: int, dt: float, fps: float | None, expected: list) -> None:
     assert Timing(fps).steps(length, dt) == expected
+
+
+def test_a_model_of_one_joint_is_drawn_from_mjx() -> None:
+    frames: Any = SimpleNamespace(_native=False)
+    state = SimpleNamespace(qpos=jnp.array([0.5]), origin=jnp.array([2.0, 0.0]))
+    np.testing.assert_array_equal(EngineFrames.snapshot(frames, state), [2.5])
 
 
 def test_writers_leave_nothing_behind_when_they_fail(tmp_path: Path) -> None:

@@ -273,6 +273,13 @@ def test_unknown_environments_are_refused_with_what_there_is(name):
 
 
 def test_unknown_engine_is_refused_with_what_there_is():
+    for name, choice, message in (
+        ("gym:Pendulum-v1", {"engine": "mjx"}, "engine='mjx': env='gym:Pendulum-v1' has its own"),
+        ("brax:ant", {"engine": "native"}, "chosen by brax_backend"),
+        ("Hopper", {"brax_backend": "mjx"}, "brax_backend='mjx': is for env=brax:NAME"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_env(name, **choice)
     with pytest.raises(ValueError, match=r"engine='bullet'.*auto.*native"):
         make_env("Hopper", engine="bullet")
 

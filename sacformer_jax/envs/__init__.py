@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sacformer_jax import env_names
-from sacformer_jax.config import ConfigError
+from sacformer_jax.config import ConfigError, TaskConfig
 from sacformer_jax.envs.checking import check_env
 from sacformer_jax.envs.core import (
     Env,
@@ -82,12 +82,14 @@ def make_env(
         limit.
 
     Raises:
-      ConfigError: an unknown name (the message lists what exists), engine or backend; or one of
-        your own that breaks the contract of :func:`check_env`.
+      ConfigError: an unknown name (the message lists what exists), engine or backend, or one that
+        such an environment does not have; or one of your own that breaks the contract of
+        :func:`check_env`.
     """
     choice = EngineChoice(engine, mjx_preset, mjx_impl)
     if not isinstance(name, str):
         return as_env(name, choice)
+    _check_choices(name, engine, brax_backend)
     if env_names.is_own(name):
         return own_env(name, choice)
     if name.startswith(BRAX_PREFIX):
@@ -113,6 +115,24 @@ def make_env(
             "MODULE:ATTRIBUTE (register_env makes a name known in its own process alone)"
         )
     return MujocoEnv(name, choice)
+
+
+def _check_choices(name: str, engine: str, brax_backend: str) -> None:
+    """Refuses physics for environments that have their own."""
+    own_physics = {
+        BRAX_PREFIX: ("auto",),
+        GYM_PREFIX: ("auto",),
+        PLAYGROUND_PREFIX: ("auto", "mjx"),
+    }
+    for prefix, engines in own_physics.items():
+        if name.startswith(prefix) and engine not in engines:
+            hint = "; its physics is chosen by brax_backend" if prefix == BRAX_PREFIX else ""
+            raise ConfigError(f"engine={engine!r}: env={name!r} has its own; use auto{hint}")
+    default = TaskConfig.brax_backend
+    if brax_backend != default and not name.startswith(BRAX_PREFIX):
+        raise ConfigError(
+            f"brax_backend={brax_backend!r}: is for env=brax:NAME, not {name!r}; use {default}"
+        )
 
 
 def as_brax(env: Env) -> BraxView:

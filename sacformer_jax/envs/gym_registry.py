@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import importlib
+import numbers
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -174,10 +176,23 @@ def _reward_terms(env_id: str, env: gymnasium.Env, actions: spaces.Box) -> tuple
         raise ConfigError(
             f"env='gym:{env_id}': its first step fails: {type(error).__name__}: {error}"
         ) from error
-    return tuple(
-        sorted(
-            name
-            for name, value in info.items()
-            if name.startswith("reward_") and np.ndim(value) == 0
-        )
-    )
+    return tuple(sorted(reward_terms(info)))
+
+
+def reward_terms(info: dict[str, Any]) -> dict[str, float]:
+    """The parts of the reward in a step's ``info``: its numbers whose names begin with
+    ``reward_``.
+    """
+    return {
+        name: float(value)
+        for name, value in info.items()
+        if name.startswith("reward_") and _is_number(value)
+    }
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, numbers.Real | np.bool_):
+        return True
+    # Not only NumPy's: whatever has a type and no axes.
+    kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    return shape == () and isinstance(kind, np.dtype) and kind.kind in "biuf"

@@ -140,6 +140,11 @@ class MjxEngine:
             _check_warp(task)
         self.task, self._impl = task, impl
         self.model = model = load_model(task)
+        if getattr(model, "nhistory", 0):  # of MuJoCo that has them
+            raise ConfigError(
+                f"task {task.name!r}: its model delays an actuator or a sensor, which MJX does not "
+                "do; use engine=native"
+            )
         if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
             model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         if iterations is None and preset == "fast":
@@ -156,6 +161,7 @@ class MjxEngine:
         free, quaternions = _joints(model)
         # A free root moves in x and y, a planar one in x.
         self._num_root = (2 if free else 1) if task.recentre_root else 0
+        self._moving = {name: _moving(model, name) for name in _IN_THE_WORLD}
         runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         self._own_runge_kutta = runge_kutta and quaternions == free and model.na == 0
         self._free_root = free
@@ -313,14 +319,22 @@ class MjxEngine:
     def _derived(self, name: str, data: mjx.Data, origin: jax.Array) -> jax.Array:
         values = getattr(data._impl if name in _NOT_PUBLIC else data, name)
         if self._num_root and name in _IN_THE_WORLD:
-            values = values.at[..., :2].add(origin)
+            values = values.at[self._moving[name], :2].add(origin)
         return values
 
 
 _NOT_PUBLIC = ("cinert", "cfrc_ext")
 _IN_THE_WORLD = ("xpos", "xipos", "subtree_com", "geom_xpos", "site_xpos")
-"""Positions that move with the root."""
+"""Positions that move with the root, where they are not the world's."""
 _ACTUATION = ("qfrc_actuator", "actuator_force")
+
+
+def _moving(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """The rows of a quantity of the world that are of bodies that are not fixed to it."""
+    if name == "subtree_com":  # of the world, that of all bodies
+        return np.arange(model.nbody)
+    bodies = {"geom_xpos": model.geom_bodyid, "site_xpos": model.site_bodyid}
+    return np.flatnonzero(model.body_weldid[bodies.get(name, np.arange(model.nbody))])
 
 
 def _joints(model: mujoco.MjModel) -> tuple[bool, int]:
