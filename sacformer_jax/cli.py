@@ -101,10 +101,6 @@ def exit_code(command: Callable[[], int]) -> int:
         return command()
     except (ConfigError, CheckpointError) as error:
         return _refused(str(error))
-    except OSError as error:
-        if error.filename is None:
-            raise
-        return _refused(f"{str(error.filename)!r}: {error.strerror}")
     except DivergedError as fault:
         print(f"error: {fault}", file=sys.stderr)
         return EXIT_DIVERGED

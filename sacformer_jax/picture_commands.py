@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -68,6 +70,18 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """What a file cannot be written for, in a line."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise ConfigError(f"{str(error.filename)!r}: {error.strerror}") from error
+
+
+@_told()
 def render(args: list[str]) -> int:
     """``sacformer render``."""
     from sacformer_jax.model_renderer import View
@@ -104,6 +118,7 @@ def render(args: list[str]) -> int:
     return 0
 
 
+@_told()
 def plot(args: list[str]) -> int:
     """``sacformer plot``."""
     from sacformer_jax.pictures import draw_runs
