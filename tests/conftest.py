@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jaxlib
 import pytest
+from compiling import QUICK_LOOPS
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -33,7 +34,7 @@ if not _inherited:
     flags = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
     # Loops are compiled by LLVM alone instead of MLIR and LLVM, in less than half the time.
     if _known_to_xla("xla_cpu_use_fusion_emitters"):
-        flags.append("--xla_cpu_use_fusion_emitters=false")
+        flags.append(QUICK_LOOPS)
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
     os.environ[_FOLDER] = tempfile.mkdtemp(prefix="sacformer-tests-")
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"

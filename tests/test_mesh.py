@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import users_flags
 
 from sacformer_jax import normalizer
 from sacformer_jax.agents.sac_update import step_weights
@@ -27,7 +28,7 @@ HERE = Path(__file__).parent
 
 def _found(*meshes: str) -> Any:
     """What a process with 8 CPU devices finds."""
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+    flags = users_flags() + " --xla_force_host_platform_device_count=8"
     done = subprocess.run(
         [sys.executable, HERE / "mesh_program.py", *meshes],
         env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": str(HERE)},
