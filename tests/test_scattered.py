@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import with_users_loops
 from replay import (
     GAMMA,
     MAX_EPISODE,
@@ -193,10 +194,10 @@ def test_vmapped_buffers_equal_single_ones():
     def sample(state, key):
         return buffer.sample(state, key, 16, jnp.float32(GAMMA))
 
-    together = jax.jit(jax.vmap(sample))(stacked, keys)
+    together = with_users_loops(jax.jit(jax.vmap(sample)), stacked, keys)(stacked, keys)
     for i, state in enumerate(states):
-        for jitted in (True, False):
-            alone = (jax.jit(sample) if jitted else sample)(state, keys[i])
+        compiled = with_users_loops(jax.jit(sample), state, keys[i])
+        for alone in (compiled(state, keys[i]), sample(state, keys[i])):
             for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
                 np.testing.assert_allclose(a, b[i], rtol=1e-6)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiling import with_users_loops
 from scipy import stats
 
 from sacformer_jax.envs import TASKS, VectorEnv, make_env
@@ -347,7 +348,7 @@ def resets(request):
         return noise, obs, fresh, stepped, jax.vmap(env.reset)(keys[:3])
 
     keys = jax.random.split(jax.random.key(0), NUM_RESETS)
-    noise, obs, fresh, stepped, reset = jax.device_get(draw(keys))
+    noise, obs, fresh, stepped, reset = jax.device_get(with_users_loops(draw, keys)(keys))
     unwrapped = gymnasium.make(env.spec.gymnasium_id).unwrapped
     yield SimpleNamespace(
         name=request.param,
