@@ -200,6 +200,13 @@ def test_any_of_all_is_one_answer_for_all_that_are_batched() -> None:
     assert any_of_all(jnp.array([False, True]))
 
 
+def test_the_whole_population_is_compiled_once(swept: Any) -> None:
+    population, state, _ = swept
+    population.train_chunk(_host(state))
+    assert population.train_chunk._cache_size() == 1
+    assert population.prefill._cache_size() == 1
+
+
 # --- numeric settings -----------------------------------------------------------------------------
 
 SWEPT = {
