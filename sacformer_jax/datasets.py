@@ -9,17 +9,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec as RegisteredSpec
 from gymnasium.envs.registration import parse_env_id
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs import gym_wrappers
 from sacformer_jax.envs.core import EnvSpec
 from sacformer_jax.envs.gym_registry import registered
 from sacformer_jax.envs.gym_wrappers import gym_wrapped_spec
 from sacformer_jax.offline import Episode
 from sacformer_jax.values import first_line
 
-_WRAPPERS = gym_wrappers.__name__
+_WRAPPERS = gym_wrapped_spec.__module__
 
 
 def minari_or_refuse(what: str) -> Any:
@@ -37,18 +37,30 @@ def minari_or_refuse(what: str) -> Any:
     return minari
 
 
-def read_episodes(dataset: str) -> list[Episode]:
+def read_episodes(dataset: str, spec: EnvSpec | None = None) -> list[Episode]:
     """The episodes of a Minari dataset, in their order.
 
     Args:
       dataset: an id among the local datasets (``"mujoco/hopper/expert-v0"``; nothing is
         downloaded), a dataset's folder, its ``data`` folder, or the HDF5 file in that.
+      spec: of the environment that is to be learnt in; None: whichever it is of.
 
     Raises:
-      ConfigError: Minari is not installed, there is no such dataset, or its observations or
-        actions are not plain vectors.
+      ConfigError: Minari is not installed, there is no such dataset, it says that it is of another
+        task than ``spec`` or of a task wrapped by us (one that does not say is believed), or its
+        observations or actions are not plain vectors.
     """
-    what, found = f"dataset={dataset!r}", _found(dataset)
+    what = f"dataset={dataset!r}"
+    minari = minari_or_refuse(what)
+    try:
+        found = _opened(minari, dataset)
+    except (FileNotFoundError, ValueError, OSError, KeyError) as error:
+        raise ConfigError(
+            f"{what}: is no local Minari dataset ({first_line(error)}); give an id that "
+            "'minari list local' shows (get one by 'minari download'), or its folder"
+        ) from error
+    if spec is not None and found.spec.env_spec is not None:
+        _check_source(what, found.spec.env_spec, spec)
     for name in ("observation", "action"):
         space = getattr(found.spec, f"{name}_space")
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
@@ -56,44 +68,20 @@ def read_episodes(dataset: str) -> list[Episode]:
     return [_episode(episode) for episode in found.iterate_episodes()]
 
 
-def check_source(dataset: str, spec: EnvSpec) -> None:
-    """Refuses a dataset that says it is of another task, or of a task wrapped by us.
-
-    Args:
-      dataset: as of :func:`read_episodes`.
-      spec: of the environment that is to be learnt in.
-
-    Raises:
-      ConfigError: it does; or as :func:`read_episodes`. A dataset that does not say is believed.
-    """
-    source = _found(dataset).spec.env_spec
-    if source is None:
-        return
+def _check_source(what: str, source: RegisteredSpec, spec: EnvSpec) -> None:
     ours = [each for each in source.additional_wrappers if each.entry_point.startswith(_WRAPPERS)]
     if ours:
         raise ConfigError(
-            f"dataset={dataset!r}: was collected with {ours[0].name}, so its steps are not those "
-            f"of env={spec.name!r}; collect one without"
+            f"{what}: was collected with {ours[0].name}, so its steps are not those of "
+            f"env={spec.name!r}; collect one without"
         )
     name = parse_env_id(source.id)[1]
     is_a_task = spec.gymnasium_id is not None and parse_env_id(spec.gymnasium_id)[1] == spec.name
     if is_a_task and name != spec.name:
         raise ConfigError(
-            f"dataset={dataset!r}: is of {source.id}, not of env={spec.name!r}; use one of that "
-            f"task, or env={name}"
+            f"{what}: is of {source.id}, not of env={spec.name!r}; use one of that task, or "
+            f"env={name}"
         )
-
-
-def _found(dataset: str) -> Any:
-    what = f"dataset={dataset!r}"
-    minari = minari_or_refuse(what)
-    try:
-        return _opened(minari, dataset)
-    except (FileNotFoundError, ValueError, OSError, KeyError) as error:
-        raise ConfigError(
-            f"{what}: is no local Minari dataset ({first_line(error)}); give an id that "
-            "'minari list local' shows (get one by 'minari download'), or its folder"
-        ) from error
 
 
 def _opened(minari: Any, dataset: str) -> Any:

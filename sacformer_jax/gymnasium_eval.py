@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from sacformer_jax.config import ConfigError
-from sacformer_jax.envs.gym_registry import registered, reward_terms, time_limit
+from sacformer_jax.envs.gym_registry import DEFAULT_LIMIT, registered, reward_terms
 from sacformer_jax.envs.gym_wrappers import gym_wrapped
 from sacformer_jax.envs.models import loading_quietly
 from sacformer_jax.envs.wrapping import UNWRAPPED, Wrapping
@@ -69,8 +69,7 @@ def evaluate_random(
     env_id: str, episodes: int, seed: int = 0, wrapping: Wrapping = UNWRAPPED
 ) -> GymnasiumEvaluation:
     """The same with uniformly random actions."""
-    limit = time_limit(registered(env_id))
-    with contextlib.closing(_made(env_id, wrapping, limit)) as env:
+    with contextlib.closing(_made(env_id, wrapping, DEFAULT_LIMIT)) as env:
         space = env.action_space
         space.seed(seed)
         return _run(env_id, env, episodes, seed, lambda obs, state, reward: (space.sample(), None))

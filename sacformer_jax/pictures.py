@@ -152,13 +152,13 @@ def draw_runs(
 
 def _compare(runs: list[RunRecords], to: Path) -> Iterator[Path]:
     to.mkdir(parents=True, exist_ok=True)
-    labels = _labels(runs)
-    rows = [row for run, label in zip(runs, labels, strict=True) for row in _rows(run, label)]
+    names = _labels(runs)
+    rows = [row for run, name in zip(runs, names, strict=True) for row in _rows(run, name)]
     title = " and ".join(dict.fromkeys(run.run.config.task.env for run in runs))
     if rows:
         comparison(rows, to / "comparison.png", "evaluations")
         yield to / "comparison.png"
-    groups = {label: list(run.records.values()) for run, label in zip(runs, labels, strict=True)}
+    groups = {name: list(run.records.values()) for run, name in zip(runs, names, strict=True)}
     diagnostics_sheet(groups, to / "diagnostics.png", title)
     yield to / "diagnostics.png"
 

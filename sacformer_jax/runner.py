@@ -15,7 +15,7 @@ from sacformer_jax.checkpoint import Progress, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.console import Reporter
 from sacformer_jax.cores import xla_threads
-from sacformer_jax.datasets import check_source, described, read_episodes
+from sacformer_jax.datasets import described, read_episodes
 from sacformer_jax.digests import num_bytes
 from sacformer_jax.lock import locked
 from sacformer_jax.logging import read_records, write_csv
@@ -155,22 +155,25 @@ def resume(
                     state, _ = jax.block_until_ready(population.refill(state))
             reporter.facts(population, state, folder.path)
             reporter.say(f"resuming at  {restored.progress.env_steps:,} env steps")
-            for what, before, now in (
-                ("CPU threads", restored.host_threads, xla_threads()),
-                *(
-                    (f"devices for the {axis}", restored.devices.get(axis, number), number)
-                    for axis, number in dataclasses.asdict(population.devices).items()
-                ),
-            ):
-                if before != now:
+            now = _split_over(xla_threads(), dataclasses.asdict(population.devices))
+            for what, before in _split_over(restored.host_threads, restored.devices).items():
+                if before != now[what]:
                     reporter.say(
-                        f"note: saved with {before} {what}, continued with {now}: right, but not "
-                        "bit for bit the same"
+                        f"note: saved with {before} {what}, continued with {now[what]}: right, but "
+                        "not bit for bit the same"
                     )
             progress = restored.progress
             return _train_on(population, folder, reporter, callbacks, state, progress)
 
     return _alone_in(folder, go_on)
+
+
+def _split_over(host_threads: int, devices: dict[str, int]) -> dict[str, int]:
+    """Over how many of what sums are split, which decides about their last bits."""
+    return {
+        "CPU threads": host_threads,
+        **{f"devices for the {axis}": number for axis, number in devices.items()},
+    }
 
 
 def dataset_of(population: Population) -> list[Episode]:
@@ -187,9 +190,9 @@ def dataset_of(population: Population) -> list[Episode]:
             f"dataset={config.offline.dataset!r}: can be read by one process only; start it in "
             "one, and resume in several"
         )
-    check_source(config.offline.dataset, population.program.env.spec)
-    episodes = read_episodes(config.offline.dataset)
-    check_episodes(episodes, population.program.env.spec, config)
+    spec = population.program.env.spec
+    episodes = read_episodes(config.offline.dataset, spec)
+    check_episodes(episodes, spec, config)
     return episodes
 
 

@@ -166,9 +166,8 @@ def _check_actor(config: Config) -> None:
             "even width of heads, or another time_embedding",
         )
         if context.tokens != "gs":
-            _check_past_in_training(
-                context, f"tokens={context.tokens!r}", "there is no action before the state", "gs"
-            )
+            why = "there is no action before the state"
+            _check_past_in_training(context, "tokens", context.tokens, why, "gs")
 
 
 def _check_policy(config: Config) -> None:
@@ -179,16 +178,19 @@ def _check_policy(config: Config) -> None:
     )
 
 
-def _check_past_in_training(context: ContextConfig, given: str, why: str, off: str) -> None:
+def _check_past_in_training(
+    context: ContextConfig, name: str, value: str, why: str, off: str
+) -> None:
     """Refuses a setting that makes nothing of windows of a single step."""
-    name = given.partition("=")[0]
     _require(
         context.context_length > 1,
-        f"{given}: with context_length=1 {why}; use {name}={off}, or context_length of 2 or more",
+        f"{name}={value!r}: with context_length=1 {why}; use {name}={off}, or context_length of 2 "
+        "or more",
     )
     _require(
         context.window_length > 1,
-        f"{given}: with learnt_steps=1 and burn_in=0 {why}; use {name}={off}, or more of either",
+        f"{name}={value!r}: with learnt_steps=1 and burn_in=0 {why}; use {name}={off}, or more of "
+        "either",
     )
 
 
@@ -350,12 +352,8 @@ def _check_acting(config: Config) -> None:
         f"acting_context={context.acting_context!r}: agent={config.agent} sees one state; use "
         "acting_context=window, or agent=sacformer",
     )
-    _check_past_in_training(
-        context,
-        f"acting_context={context.acting_context!r}",
-        "training never shows what came before",
-        "window",
-    )
+    why = "training never shows what came before"
+    _check_past_in_training(context, "acting_context", context.acting_context, why, "window")
     _require(
         limit is None or limit >= context.context_length,
         f"acting_context_limit={limit}: is below "
@@ -373,7 +371,7 @@ def _check_critic(config: Config) -> None:
         f"critic={critic.critic!r}: agent={config.agent} sees one step; use critic=mlp, or "
         "agent=sacformer",
     )
-    _check_past_in_training(config.context, f"critic={critic.critic!r}", "it sees one step", "mlp")
+    _check_past_in_training(config.context, "critic", critic.critic, "it sees one step", "mlp")
     _require(
         critic.critic_width % critic.critic_heads == 0,
         f"critic_heads={critic.critic_heads}: must divide critic_width={critic.critic_width}",

@@ -26,7 +26,7 @@ from sacformer_jax import (
 )
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.collecting import make_collector
-from sacformer_jax.datasets import check_source, read_episodes, write_episodes
+from sacformer_jax.datasets import read_episodes, write_episodes
 from sacformer_jax.digests import digest
 from sacformer_jax.distributions import NoisyPoint, TanhGaussian
 from sacformer_jax.envs import VectorEnv, make_env, wrapped
@@ -404,14 +404,14 @@ def test_a_dataset_that_is_not_there_is_refused_before_anything_is_written(tmp_p
 
 def test_a_dataset_of_another_task_is_refused(dataset: Path) -> None:
     hopper = make_env("Hopper")
-    check_source(str(dataset), hopper.spec)
+    read_episodes(str(dataset), hopper.spec)
     with pytest.raises(ConfigError, match=r"is of Hopper-v5, not of env='Walker2d'.* env=Hopper"):
-        check_source(str(dataset), make_env("Walker2d").spec)
+        read_episodes(str(dataset), make_env("Walker2d").spec)
     delayed = wrapped(hopper, action_delay=2).spec
     episodes = read_episodes(str(dataset))[:1]
     write_episodes(episodes, "test/delayed-v0", delayed, "nobody", "as if delayed")
     with pytest.raises(ConfigError, match=r"was collected with ActionDelay, .*env='Hopper'"):
-        check_source("test/delayed-v0", hopper.spec)
+        read_episodes("test/delayed-v0", hopper.spec)
 
 
 @pytest.mark.parametrize("whole", [0, 3])

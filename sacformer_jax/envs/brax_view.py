@@ -50,7 +50,7 @@ class BraxView(brax_envs.Env):
     def step(self, state: brax_envs.State, action: jax.Array) -> brax_envs.State:
         """One step under ``action [A]`` in the unit box."""
         env_state, step = self.env.step(state.pipeline_state, self.to_bounds(action))
-        bad = step.bad | ~(jnp.isfinite(step.obs).all() & jnp.isfinite(step.reward))
+        bad = step.broke_down
         terms = {name: jnp.where(bad, 0.0, value) for name, value in step.reward_terms.items()}
         return state.replace(
             pipeline_state=env_state,

@@ -87,6 +87,11 @@ class EnvStep:
     reward_terms: dict[str, jax.Array]
     truncated: jax.Array = flax.struct.field(default_factory=lambda: jnp.zeros((), bool))
 
+    @property
+    def broke_down(self) -> jax.Array:
+        """Bool: ``bad``, or not said to be, but the observation or the reward is not finite."""
+        return self.bad | ~jnp.all(jnp.isfinite(self.obs), axis=-1) | ~jnp.isfinite(self.reward)
+
 
 class Env(Protocol):
     """Pure functions of one environment; vectorized with ``jax.vmap``."""
@@ -276,7 +281,7 @@ class VectorEnv:
         (env_state, step), prepared = self.env.step_and_refill(
             state.env, action, state.refill, state.prepared, lambda: self._keys(state.key)
         )
-        bad = step.bad | ~jnp.all(jnp.isfinite(step.obs), axis=-1) | ~jnp.isfinite(step.reward)
+        bad = step.broke_down
         time_step = state.time_step + 1
         terminated = step.terminated & ~bad
         cut_off = step.truncated | (time_step >= self.max_episode_steps)

@@ -161,7 +161,6 @@ class MjxEngine:
         free, quaternions = _joints(model)
         # A free root moves in x and y, a planar one in x.
         self._num_root = (2 if free else 1) if task.recentre_root else 0
-        self._moving = {name: _moving(model, name) for name in _IN_THE_WORLD}
         runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         self._own_runge_kutta = runge_kutta and quaternions == free and model.na == 0
         self._free_root = free
@@ -319,7 +318,7 @@ class MjxEngine:
     def _derived(self, name: str, data: mjx.Data, origin: jax.Array) -> jax.Array:
         values = getattr(data._impl if name in _NOT_PUBLIC else data, name)
         if self._num_root and name in _IN_THE_WORLD:
-            values = values.at[self._moving[name], :2].add(origin)
+            values = values.at[_moving(self.model, name), :2].add(origin)
         return values
 
 
