@@ -134,8 +134,10 @@ def evaluate(args: list[str]) -> int:
     if parsed.json:
         return 0
     if parsed.gymnasium:
-        wrapping = RunFolder(parsed.run).read_spec().wrapping
-        baseline = evaluate_random(record["env"], parsed.episodes, parsed.seed, wrapping)
+        spec = RunFolder(parsed.run).read_spec()
+        baseline = evaluate_random(
+            record["env"], parsed.episodes, parsed.seed, spec.wrapping, spec.max_episode_steps
+        )
         rows["random actions"] = baseline.record()
     print(f"{record['env']}, {parsed.episodes} episodes")
     width = max(15, *(len(name) for name in rows))

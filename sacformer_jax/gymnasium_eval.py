@@ -66,10 +66,17 @@ def evaluate_policy(policy: Policy, episodes: int, seed: int = 0) -> GymnasiumEv
 
 
 def evaluate_random(
-    env_id: str, episodes: int, seed: int = 0, wrapping: Wrapping = UNWRAPPED
+    env_id: str,
+    episodes: int,
+    seed: int = 0,
+    wrapping: Wrapping = UNWRAPPED,
+    limit: int = DEFAULT_LIMIT,
 ) -> GymnasiumEvaluation:
-    """The same with uniformly random actions."""
-    with contextlib.closing(_made(env_id, wrapping, DEFAULT_LIMIT)) as env:
+    """The same with uniformly random actions.
+
+    ``limit`` is the longest episode, in steps, of an id that is registered without a time limit.
+    """
+    with contextlib.closing(_made(env_id, wrapping, limit)) as env:
         space = env.action_space
         space.seed(seed)
         return _run(env_id, env, episodes, seed, lambda obs, state, reward: (space.sample(), None))

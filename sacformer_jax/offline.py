@@ -147,7 +147,8 @@ def lay_out(episodes: Sequence[Episode], buffer: TrajectoryBuffer) -> Layout:
             return Layout(steps, total - kept)
     raise ConfigError(
         f"dataset: {total} steps in {len(episodes)} episodes are too few for num_envs="
-        f"{buffer.num_envs} columns of at least context_length={buffer.context_length} steps"
+        f"{buffer.num_envs} columns of {buffer.context_length} steps, which is what an update "
+        "learns from at a time; use more steps, or a smaller num_envs"
     )
 
 

@@ -58,11 +58,13 @@ def test_an_id_without_a_limit_ends_and_its_parts_of_the_reward_are_numbers() ->
     gymnasium.register("Tests/Endless-v0", Endless)
     try:
         found = evaluate_random("Tests/Endless-v0", 1)
+        as_in_training = evaluate_random("Tests/Endless-v0", 2, limit=7)
         live = gym_registry.find("Tests/Endless-v0", 5)
         live.env.close()
     finally:
         del gymnasium.registry["Tests/Endless-v0"]
     assert found.lengths.tolist() == [1000]
+    assert as_in_training.lengths.tolist() == [7, 7]
     assert found.reward_terms == {"reward_near": 0.5, "reward_at": 0.25, "reward_on": 1.0}
     assert live.facts.reward_terms == ("reward_at", "reward_near", "reward_on")
 

@@ -133,8 +133,10 @@ def test_hindsight_returns_are_those_of_the_whole_episode(num_envs: int) -> None
 
 
 def test_too_few_steps_are_refused() -> None:
-    with pytest.raises(ConfigError, match="7 steps in 1 episodes are too few for num_envs=3"):
-        lay_out(_episodes([7]), _buffer(3))
+    buffer = _buffer(3)
+    told = f"7 steps in 1 episodes are too few for num_envs=3 columns of {buffer.context_length} "
+    with pytest.raises(ConfigError, match=told):
+        lay_out(_episodes([7]), buffer)
 
 
 # --- imitation -----------------------------------------------------------------------------------

@@ -159,8 +159,8 @@ def markdown(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str
         parts += [
             "## At equal wall-clock",
             "The same two, with every run stopped after the seconds of training in which "
-            f"{label_of(baseline)} makes all its env steps on the task. Of the tasks where both "
-            "have runs of as many seeds on the same model of processor.",
+            f"{label_of(baseline)} makes all its env steps on the task. Only tasks count "
+            "where both have runs of as many seeds on the same model of processor.",
             _timed_table(study, baseline),
         ]
     if study.name in COMPARED_WITH_PUBLISHED:
