@@ -38,6 +38,7 @@ from diagnosis.table import Runs, rows, table
 from rich.console import Console
 
 from sacformer_jax import CheckpointError, ConfigError
+from sacformer_jax.cli import EXIT_BAD_INPUT
 from sacformer_jax.run_folder import labels
 
 
@@ -64,16 +65,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     amounts = Amounts(args.batches, args.episodes, args.windows, args.seed)
     console = Console()
     runs: Runs = {}
+    failure: Exception | None = None
     try:
         for label, run in zip(labels(args.runs), args.runs, strict=True):
             runs[label] = diagnose(run, amounts, lambda line: print(line, file=sys.stderr))
     except (CheckpointError, ConfigError, FloatingPointError) as error:
-        parser.error(str(error))
+        if not runs:
+            parser.error(str(error))
+        failure = error  # the others took minutes
     console.print(table(runs))
     if args.json is not None:
         args.json.write_text(json.dumps(rows(runs), indent=1) + "\n")
     if args.picture is not None:
         draw(runs, amounts.batches, args.picture)
+    if failure is not None:
+        print(f"{parser.prog}: error: {failure}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     return 0
 
 

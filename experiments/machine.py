@@ -18,3 +18,8 @@ def cpu_model() -> str:
     name = facts.get("model name") or platform.processor() or UNKNOWN
     numbers = [facts[key] for key in ("cpu family", "model", "stepping") if key in facts]
     return f"{name} {'/'.join(numbers)}".strip()
+
+
+def cpu_with_cores(cores: int) -> str:
+    """The processor, and how many of its cores a run had."""
+    return f"{cpu_model()}, {cores} core{'s' if cores > 1 else ''}"

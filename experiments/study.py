@@ -22,19 +22,20 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import figures
-from machine import UNKNOWN, cpu_model
-from study_rows import rows_of
+from machine import UNKNOWN, cpu_with_cores
+from report.scores import variant_of
+from study_rows import NOT_COMPARED, rows_of, settings_digest
 from study_table import Row, read_table, summary, write_table
 
+import sacformer_jax
 from sacformer_jax import Config, ConfigError, resume, train
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.cli import EXIT_INTERRUPTED
+from sacformer_jax.cores import usable_cores
 
 EXIT_FAILED = 1
 SCALES = ("cpu", "full")
 _POLL_SECONDS = 0.2
-# What may differ between a run's folder and the study: where it lies and how far it goes.
-_NOT_COMPARED = {"run_dir", "total_env_steps"}
 
 
 @dataclasses.dataclass
@@ -82,7 +83,7 @@ class Study:
         arguments: Sequence[str] | None = None,
         parents: Sequence[argparse.ArgumentParser] = (),
     ) -> int:
-        """The command line; 0 when all is done, 3 when stopped by a signal, 1 if a run failed."""
+        """The command line; 0 when all is done, 3 after a signal, else 1 if a run failed."""
         parser = argparse.ArgumentParser(
             description=f"Runs of the study {self.name!r}.", parents=list(parents)
         )
@@ -115,6 +116,12 @@ class Study:
                     f"{self.runs / name} was trained with other settings ({', '.join(changed)}): "
                     "move it away to train anew"
                 )
+            if others := self._of_other_settings(name):
+                parser.error(
+                    f"{self.table} has {', '.join(others)}, trained with other settings than "
+                    f"{name} would be now, and counts them as the same: rename those runs, or take "
+                    "their rows out"
+                )
         shares = [cores[i :: args.jobs] for i in range(args.jobs)] if args.jobs > 1 else [[]]
         code = self._train(names, shares)
         self.write(names)
@@ -136,7 +143,23 @@ class Study:
         if folder.latest_step() is None:
             return []
         now, then = self.configs[name].flat(), folder.read_config().config.flat()
-        return [field for field in now if field not in _NOT_COMPARED and now[field] != then[field]]
+        return [field for field in now if field not in NOT_COMPARED and now[field] != then[field]]
+
+    def _of_other_settings(self, name: str) -> list[str]:
+        """Runs in the table that are seeds of the same variant on the same task, trained with other
+        settings. A run of this very name is not among them where it is to be trained anew.
+        """
+        config = self.configs[name]
+        digest = settings_digest(config)
+        variant = variant_of({"run": name, "env": config.task.env, "seed": config.all_seeds[0]})
+        others = {
+            row["run"]
+            for row in read_table(self.table)
+            if (row["env"], variant_of(row)) == (config.task.env, variant)
+            and row["run"] != name
+            and (row.get("settings") or digest) != digest
+        }
+        return sorted(others)
 
     def _train(self, names: list[str], shares: list[list[int]]) -> int:
         """Keeps one worker on each share of the cores; signals are passed on to the workers."""
@@ -172,12 +195,11 @@ class Study:
                 worker.process.terminate()
             for number, handler in previous.items():
                 signal.signal(number, handler)
-        if asked:
-            return EXIT_INTERRUPTED
         if failed:
             print(f"failed: {', '.join(failed)}", file=sys.stderr)
-            return EXIT_FAILED
-        return 0
+        if asked:
+            return EXIT_INTERRUPTED
+        return EXIT_FAILED if failed else 0
 
     def _start(self, name: str, cores: list[int]) -> _Worker:
         """Starts a run's worker: on the terminal, or with a log where several run side by side."""
@@ -207,14 +229,16 @@ class Study:
     # --- results -----------------------------------------------------------------------------
 
     def _note_origin(self, name: str) -> None:
-        """Keeps by which versions of the code a run was trained, and on which processors."""
+        """Keeps by which versions of the library a run was trained, and on how many cores of which
+        processors.
+        """
         described = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--exclude=*"],
-            cwd=self.script.parent, capture_output=True, text=True, check=False,
+            cwd=Path(sacformer_jax.__file__).parent, capture_output=True, text=True, check=False,
         )  # fmt: skip
         begins = self._folder(name).latest_step() is None
         commit = described.stdout.strip() or UNKNOWN
-        for what, value in (("commits", commit), ("cpus", cpu_model())):
+        for what, value in (("commits", commit), ("cpus", cpu_with_cores(usable_cores()))):
             noted = [] if begins else self._noted(name, what) or [UNKNOWN]
             if value not in noted:
                 self._notes(name, what).write_text("\n".join([*noted, value]) + "\n")

@@ -17,6 +17,7 @@ from report.scores import run_scores
 COLUMNS = (
     "study", "run", "agent", "preset", "env", "engine", "seed", "env_steps", "return_mean",
     "return_std", "episodes", "wall_s", "commit", "cpu",
+    "settings",
 )  # fmt: skip
 
 MORE = "+"
@@ -81,6 +82,6 @@ def summary(rows: Iterable[Row], runs: Iterable[str]) -> str:
             lines.append(
                 f"| {run} | {seed} | {own[-1]['env_steps']:,} | {returns[-1]:.0f} "
                 f"| {run_scores(returns):.0f} | {returns.max():.0f} "
-                f"| {float(own[-1]['wall_s']):,.0f} |"
+                f"| {f'{float(seconds):,.0f}' if (seconds := own[-1]['wall_s']) else '?'} |"
             )
     return "\n".join(lines)

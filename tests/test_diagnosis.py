@@ -472,7 +472,9 @@ def test_the_script(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.slow
-def test_the_script_on_trained_runs_of_both_agents(tmp_path: Path) -> None:
+def test_the_script_on_trained_runs_of_both_agents(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     tiny = {
         "env": "Hopper", "num_envs": 2, "max_episode_steps": 40, "prefill_env_steps": 200,
         "chunk_env_steps": 20, "total_env_steps": 220, "eval_every": 10_000, "eval_episodes": 2,
@@ -496,7 +498,10 @@ def test_the_script_on_trained_runs_of_both_agents(tmp_path: Path) -> None:
         config = Config.from_preset("cpu", agent=agent, run_dir=paths[-1], **tiny, **fields)
         train(config, quiet=True)
     to, picture = tmp_path / "numbers.json", tmp_path / "picture.png"
-    assert diagnose.main([*paths, *FEW, "--json", str(to), "--picture", str(picture)]) == 0
+    files = ["--json", str(to), "--picture", str(picture)]
+    # What comes after them and cannot be diagnosed costs nothing that was measured.
+    assert diagnose.main([*paths, str(tmp_path / "nothing"), *FEW, *files]) == 2
+    assert "no config.json there" in capsys.readouterr().err
     rows = {(row["run"], row["member"]): row for row in json.loads(to.read_text())}
     assert [run for run, _ in rows] == ["sacformer"] * 2 + ["sac"] * 3
     assert sections_of(rows["sacformer", "mean"]) == SECTIONS

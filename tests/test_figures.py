@@ -262,6 +262,56 @@ def test_a_run_that_was_held_up_is_no_slower(tmp_path: Path) -> None:
     assert math.isnan(step_seconds(line, program))
 
 
+def test_a_run_that_was_held_up_most_of_the_time_is_no_slower_either(tmp_path: Path) -> None:
+    study = read(tmp_path / "arena.csv", {"Hopper-sac": [list(range(25))] * 2})
+    line, program = study.lines["Hopper", "sac"], Program("A", 2)
+    for of_seed in line.seconds.values():
+        of_seed.update({step: 3 * at for step, at in of_seed.items() if step > 4_000})
+    assert step_seconds(line, program) == pytest.approx(0.5 / 1_000)
+
+
+def test_lost_records_of_seconds_are_no_seconds(tmp_path: Path) -> None:
+    study = read(tmp_path / "arena.csv", {"Hopper-sac": [list(range(9))] * 2})
+    line, program = study.lines["Hopper", "sac"], Program("A", 2)
+    line.seconds = {
+        0: {1_000: math.nan, 2_000: math.nan, 3_000: 1.0, 4_000: 1.5, 5_000: 0.5, 6_000: 1.0}
+    }
+    assert step_seconds(line, program) == pytest.approx(0.5 / 1_000)
+    line.seconds = {0: {1_000: 0.0, 2_000: 0.0, 3_000: math.nan}}
+    assert math.isnan(step_seconds(line, program))
+
+
+def test_a_lost_beginning_of_one_seed_is_not_taken_for_random_steps(tmp_path: Path) -> None:
+    flat = [returns_for("Hopper", *[0.5] * 8)] * 2
+    runs = {"Hopper-sacformer": flat, "Hopper-sac": flat}
+    study = read(tmp_path / "a.csv", runs, seconds={"Hopper-sacformer": 2.0, "Hopper-sac": 1.0})
+    own = study.lines["Hopper", "sacformer"]
+    for step in (1_000, 2_000, 3_000):
+        del own.curves[0][step]
+    assert (own.first_step, own.steps[0]) == (1_000, 4_000)
+    # Half of SAC's 7,000 steps after its first evaluation, so those at 4,000 are counted alone.
+    (one,) = timed(study, "sac")
+    assert one.slowdown == pytest.approx(2.0)
+    own.curves[0][5_000] = own.curves[1][5_000] = returns_for("Hopper", 9.0)[0]
+    del own.__dict__["steps"]
+    assert timed(study, "sac")[0].difference.value == pytest.approx(0.0)
+
+
+def test_seeds_that_are_being_added_do_not_cut_a_line_short(tmp_path: Path) -> None:
+    finished = returns_for("Hopper", *[0.5] * 8)
+    runs = {"Hopper-sac": [finished] * 2, "Hopper-sacformer": [finished] * 2}
+    begun = runs | {"Hopper-sac-from-2": [returns_for("Hopper", 0.1, 0.2)] * 2}
+    study = read(tmp_path / "a.csv", begun)
+    assert study.lines["Hopper", "sac"].seeds == [0, 1]
+    assert study.finished("Hopper", "sac")
+    text = markdown(study, aggregates(study, "sac"), "sac")
+    assert "Not finished: run Hopper-sac-from-2 (2,000 env steps)." in text
+    grown = runs | {"Hopper-sac-from-2": [finished] * 2}
+    study = read(tmp_path / "a.csv", grown)
+    assert study.lines["Hopper", "sac"].seeds == [0, 1, 2, 3]
+    assert not study.added
+
+
 def test_seconds_are_compared_on_the_same_processor(tmp_path: Path) -> None:
     flat = [returns_for("Hopper", *[0.5] * 8)] * 2
     runs = {"Hopper-sacformer": flat, "Hopper-sac": flat}

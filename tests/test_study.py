@@ -13,6 +13,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import machine
 import pytest
 import study as studies
 from study_table import read_table, summary
@@ -100,15 +101,53 @@ def test_where_a_run_was_trained_is_noted(tmp_path: Path, monkeypatch: pytest.Mo
     study.runs.mkdir()
     monkeypatch.setattr(RunFolder, "latest_step", lambda folder: latest)
     for cpu in ("A", "B"):  # it had no checkpoint, and begins anew
-        monkeypatch.setattr(studies, "cpu_model", lambda cpu=cpu: cpu)
+        monkeypatch.setattr(machine, "cpu_model", lambda cpu=cpu: cpu)
         study._note_origin("Hopper-a")
     _pretend(study, "Hopper-b", [1.0], [2.0])
     (study.runs / "Hopper-b.cpus").unlink()  # begun before they were noted, or elsewhere
     latest = 100
     study._note_origin("Hopper-b")
     study._note_origin("Hopper-b")
-    assert (study.runs / "Hopper-a.cpus").read_text() == "B\n"
-    assert {row["cpu"] for row in study.rows("Hopper-b")} == {"unknown+B"}
+    cores = usable_cores()
+    cpu = f"B, {cores} core{'s' if cores > 1 else ''}"
+    assert (study.runs / "Hopper-a.cpus").read_text() == f"{cpu}\n"
+    assert {row["cpu"] for row in study.rows("Hopper-b")} == {f"unknown+{cpu}"}
+
+
+def test_seconds_that_are_lost_are_unknown(tmp_path: Path) -> None:
+    """Not 0, as before the first update."""
+    study = _study(tmp_path)
+    _pretend(study, "Hopper-a", [1.0, 2.0, 3.0, 4.0])
+    timings = RunFolder(study.configs["Hopper-a"].run.run_dir).timings_path
+    timings.write_text(json.dumps({"env_steps": 400, "chunk_seconds": 1.5}) + "\n")
+    assert [row["wall_s"] for row in study.rows("Hopper-a")] == [0.0, 0.0, "", 1.5]
+    study.write(["Hopper-a"])
+    assert "| Hopper-a | 3 | 400 | 4 | 2 | 4 | 2 |" in summary(
+        read_table(study.table), ["Hopper-a"]
+    )
+
+
+def test_seeds_of_other_settings_are_no_seeds_of_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A preset that changes must not go on under the name that it had."""
+    study = _study(tmp_path, "")
+    _pretend(study, "Hopper-a", [5.0])
+    study.write(["Hopper-a"])
+    shutil.rmtree(study.runs)
+
+    def with_more_seeds(**changed: float) -> studies.Study:
+        more = {"Hopper-a-from-7": _config((7,)).replace(**changed), **study.configs}
+        return studies.Study("tiny", more, study.script, runs=tmp_path / "runs")
+
+    with pytest.raises(SystemExit) as refused:
+        with_more_seeds(tau=0.1).main(["--only", "Hopper-a-from-7"])
+    assert refused.value.code == 2
+    said = capsys.readouterr().err
+    assert "tiny.csv has Hopper-a, trained with other settings than Hopper-a-from-7" in said
+    assert not study.runs.exists()
+    assert with_more_seeds().main(["--only", "Hopper-a-from-7"]) == 0
+    assert with_more_seeds(tau=0.1).main(["--only", "Hopper-b"]) == 0
 
 
 def test_rows_of_runs_not_asked_for_stay(tmp_path: Path) -> None:

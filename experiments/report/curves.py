@@ -223,7 +223,9 @@ def _caption(study: StudyLines, averages: dict[str, _Curve], in_panels: bool = F
         )
         text += ", band 95 % stratified bootstrap." if max(seeds) > 1 else "."
         missing = [label_of(name) for name in study.variants if name not in averages]
-        if missing and not in_panels:
+        if missing and in_panels:
+            text += " Only of variants that have begun on every task."
+        elif missing:
             text += f" Without {', '.join(missing)}, not begun on every task."
     if in_panels and not_begun(study):
         text += " Empty panels: not begun."

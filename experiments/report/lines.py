@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from machine import UNKNOWN
-from study_table import MORE, read_table
+from study_table import MORE, Row, read_table
 
 from report.scores import REFERENCE_RETURNS, run_scores, variant_of
 
@@ -37,7 +37,7 @@ class Program:
     """What a seed was trained in, on which its seconds depend.
 
     Attributes:
-      cpu: the processor, or all that a resumed run had.
+      cpu: the processor and the number of its cores, or all that a resumed run had.
       num_seeds: how many there were in it.
     """
 
@@ -96,6 +96,11 @@ class Line:
         return run_scores(self.returns.T)
 
     @property
+    def first_step(self) -> int:
+        """Of the first evaluation of any seed, before it learnt anything."""
+        return min(min(curve) for curve in self.curves.values())
+
+    @property
     def last_step(self) -> int:
         """The last of ``steps``; 0 if there is none."""
         return int(self.steps[-1]) if self.steps.size else 0
@@ -113,6 +118,8 @@ class StudyLines:
       episodes: of an evaluation, every number that occurs.
       engines: likewise.
       presets: likewise.
+      added: env steps of runs that add seeds to a line, but not yet as far as it goes. They are
+        left out of it.
     """
 
     name: str
@@ -122,6 +129,7 @@ class StudyLines:
     episodes: list[int]
     engines: list[str]
     presets: list[str]
+    added: dict[str, int]
 
     @property
     def last_step(self) -> int:
@@ -157,6 +165,8 @@ def is_study_table(path: Path) -> bool:
 def read_study(path: Path) -> StudyLines | None:
     """The lines of ``results/STUDY.csv``; None if it has no rows."""
     rows = read_table(path)
+    added = _unfinished_additions(rows)
+    rows = [row for row in rows if row["run"] not in added]
     lines: dict[tuple[str, str], Line] = {}
     num_seeds = Counter(run for run, _ in {(row["run"], row["seed"]) for row in rows})
     for row in rows:
@@ -180,7 +190,28 @@ def read_study(path: Path) -> StudyLines | None:
         episodes=sorted({int(row["episodes"]) for row in rows}),
         engines=sorted({row["engine"] for row in rows}),
         presets=sorted({row.get("preset") or UNKNOWN for row in rows}),
+        added=added,
     )
+
+
+def _unfinished_additions(rows: Iterable[Row]) -> dict[str, int]:
+    """Runs whose seeds belong to a line that another run has taken further, and how far they are.
+
+    A line goes as far as all its seeds: seeds that are being added would cut it short.
+    """
+    last: dict[tuple[str, str], dict[tuple[str, str], int]] = {}
+    for row in rows:
+        seeds = last.setdefault((row["env"], variant_of(row)), {})
+        seed = row["run"], row["seed"]
+        seeds[seed] = max(seeds.get(seed, 0), row["env_steps"])
+    added: dict[str, int] = {}
+    for seeds in last.values():
+        runs: dict[str, int] = {}
+        for (run, _), steps in seeds.items():
+            runs[run] = min(runs.get(run, steps), steps)
+        furthest = max(runs.values())
+        added |= {run: steps for run, steps in runs.items() if steps < FINISHED_SHARE * furthest}
+    return added
 
 
 def _ordered(variants: list[str]) -> list[str]:

@@ -160,7 +160,7 @@ def markdown(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str
             "## At equal wall-clock",
             "The same two, with every run stopped after the seconds of training in which "
             f"{label_of(baseline)} makes all its env steps on the task. Only tasks count "
-            "where both have runs of as many seeds on the same model of processor.",
+            "where both have runs of as many seeds on as many cores of the same processor.",
             _timed_table(study, baseline),
         ]
     if study.name in COMPARED_WITH_PUBLISHED:
@@ -204,13 +204,15 @@ def not_begun(study: StudyLines) -> list[str]:
 
 
 def in_progress(study: StudyLines) -> list[str]:
-    """Lines that are shorter than the study's: ``SAC on Ant (40,000 env steps)``."""
+    """Lines that are shorter than the study's, and runs that are to add seeds to one:
+    ``SAC on Ant (40,000 env steps)``, ``run Ant-sac-from-5 (8,000 env steps)``.
+    """
     return [
         f"{label_of(variant)} on {task} ({study.lines[task, variant].last_step:,} env steps)"
         for variant in study.variants
         for task in study.tasks
         if (task, variant) in study.lines and not study.finished(task, variant)
-    ]
+    ] + [f"run {run} ({steps:,} env steps)" for run, steps in study.added.items()]
 
 
 def _unfinished(study: StudyLines) -> list[str]:

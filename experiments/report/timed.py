@@ -2,10 +2,11 @@
 
 Seconds are those of training, all seeds of a run together, without compilation and evaluations:
 they say something where runs had the same share of the same machine, as in the studies named here.
-So they are compared among runs of as many seeds on the same model of processor alone (which need
-not be the same machine, nor a machine with nothing else to do). An env step takes the median over
-the stretches between evaluations, all of them the same work: a run that was held up for a while is
-no slower for it.
+So they are compared among runs of as many seeds on as many cores of the same processor alone (which
+need not be the same machine, nor a machine with nothing else to do). The stretches between
+evaluations are all the same work, and what else a machine does only adds to it: an env step is
+taken to cost what it did in the fastest tenth of them, so that a run that was held up, even for
+most of the time, is no slower for it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from report.scores import (
 
 TIMED = {"arena", "arena-hidden", "arena-delay", "improve-100k"}
 """Studies whose runs had a core each."""
+_FASTEST = 0.1
+"""The quantile of the stretches that stands for all."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,15 +76,17 @@ def timed(study: StudyLines, baseline: str) -> list[Timed]:
 
 
 def step_seconds(line: Line, program: Program) -> float:
-    """What an env step of all seeds takes a line in such a program; NaN with fewer than two
-    evaluations.
+    """What an env step of all seeds takes a line in such a program; NaN where no two evaluations
+    tell.
     """
     of_stretches: list[float] = []
     for seed, of_seed in line.seconds.items():
         steps = np.array(sorted(of_seed), float)
         if line.programs[seed] == program and steps.size > 1:
             of_stretches.extend(np.diff([of_seed[int(step)] for step in steps]) / np.diff(steps))
-    return float(np.median(of_stretches)) if of_stretches else math.nan
+    # Seconds are unknown, or begin anew, where a resumed run's records were lost.
+    whole = [seconds for seconds in of_stretches if seconds > 0]
+    return float(np.quantile(whole, _FASTEST)) if whole else math.nan
 
 
 def _slowdown(own: Line, base: Line) -> float | None:
@@ -108,4 +113,4 @@ def scores_until(line: Line, limit: float) -> np.ndarray:
 
 def _steps_for(own: Line, base: Line, slowdown: float) -> float:
     """Env steps in the baseline's time. Those to the first evaluation are random, and free."""
-    return float(own.steps[0]) + (base.last_step - float(base.steps[0])) / slowdown
+    return own.first_step + (base.last_step - base.first_step) / slowdown
