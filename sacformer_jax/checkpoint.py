@@ -94,7 +94,9 @@ class CheckpointWriter:
             self._close()
             self._silence.close()
 
-    def save(self, state: TrainState, policy: PolicyState, progress: Progress) -> None:
+    def save(
+        self, state: TrainState, policy: PolicyState, progress: Progress
+    ) -> CheckpointError | None:
         """Saves a checkpoint under ``progress.env_steps``, where there is none yet.
 
         Returns when it has a copy of the arrays, so that they may be donated at once.
@@ -104,14 +106,21 @@ class CheckpointWriter:
           policy: of all members, leaves ``[S, ...]``.
           progress: of the host loop.
 
+        Returns:
+          what became of the save before this one, if it failed since.
+
         Raises:
-          CheckpointError: the save before this one failed, and this one was not tried; or this one
-            fails already. Older checkpoints are as they were, and the next call tries again.
+          CheckpointError: this one fails already. Older checkpoints are as they were, and the next
+            call tries again.
         """
-        self.wait()
+        failed_before: CheckpointError | None = None
+        try:
+            self.wait()
+        except CheckpointError as error:
+            failed_before = error
         step = progress.env_steps
         if processes.of_the_first(step if step in self._folder.steps() else None) is not None:
-            return
+            return failed_before
         state, policy = _snapshot(state), _snapshot(policy)
         each = jax.tree.map(lambda _: 1, policy)
         metadata = stored.sealed(
@@ -143,6 +152,7 @@ class CheckpointWriter:
             )
         except Exception as error:  # Orbax raises many kinds
             raise self._failed(error) from error
+        return failed_before
 
     def wait(self) -> None:
         """Returns when the checkpoint given last is on disk.

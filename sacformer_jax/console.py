@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +28,22 @@ def _count(params: object) -> str:
     return f"{sum(leaf.size // leaf.shape[0] for leaf in jax.tree.leaves(params)):,}"
 
 
+class _Output(Console):
+    """Prints as long as somebody reads: a run goes on when nobody does, or when a log is full."""
+
+    def on_broken_pipe(self) -> None:
+        """Prints nothing any more, where Rich would end the program."""
+        self.quiet = True
+        with contextlib.suppress(OSError, ValueError):  # what Python flushes at its end, too
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+    def _check_buffer(self) -> None:
+        try:
+            super()._check_buffer()
+        except OSError:
+            del self._buffer[:]  # this line is lost, others may be printed again
+
+
 class _Speed(ProgressColumn):
     """Environment steps per second since the program started."""
 
@@ -42,7 +60,7 @@ class Reporter:
     """
 
     def __init__(self, quiet: bool = False):
-        self.console = Console(quiet=quiet, highlight=False, soft_wrap=True, emoji=False)
+        self.console = _Output(quiet=quiet, highlight=False, soft_wrap=True, emoji=False)
         self._bar = Progress(
             TextColumn("{task.completed:,.0f}/{task.total:,.0f} env steps"),
             BarColumn(bar_width=30),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +11,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sacformer_jax.checkpoint import CheckpointWriter, RunFolder
+from sacformer_jax.checkpoint import CheckpointError, CheckpointWriter, RunFolder
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.members import Member
 from sacformer_jax.policy import member_index
 from sacformer_jax.population import make_population
 from sacformer_jax.train import policy_of
+from sacformer_jax.values import first_line
 
 
 def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> Path:
@@ -34,9 +36,11 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
 
     Raises:
       ConfigError: no such member, or one twice.
-      CheckpointError: there is no checkpoint, or the new folder holds a run or cannot be written.
+      CheckpointError: there is no checkpoint, or the new folder holds something already or cannot
+        be written. It is there as a whole or not at all.
     """
     folder, target = RunFolder(path).opened(), RunFolder(to)
+    _check_new(target.path)
     run = folder.read_config()
     places = [member_index(run.members, member) for member in members]
     if not places or len(set(places)) < len(places):
@@ -59,20 +63,38 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
     config = _config_of(run.config, chosen).replace(run_dir=str(target.path))
     if len(chosen) == 1:
         chosen = (Member(chosen[0].name, chosen[0].seed),)  # its settings are the run's own now
-    target.create(config, run.sources, folder.read_spec(), chosen)
-    for member, place, num_bytes in zip(chosen, places, progress.metrics_bytes, strict=True):
-        source, goal = (
-            folder.member_path(run.members[place].name), target.member_path(member.name)
-        )  # fmt: skip
-        goal.mkdir(exist_ok=True)
-        metrics = folder.metrics_path(run.members[place].name)
-        if metrics.exists():
-            target.metrics_path(member.name).write_bytes(metrics.read_bytes()[:num_bytes])
-        if (source / "best").is_dir():
-            shutil.copytree(source / "best", goal / "best")
-    with CheckpointWriter(target, config, block_axes) as writer:
-        writer.save(state, policy_of(state), progress)
+    # A folder without a checkpoint would be a run that is to start from the beginning.
+    part = RunFolder(target.path.with_name(f".{target.path.name}.new"))
+    shutil.rmtree(part.path, ignore_errors=True)
+    try:
+        part.create(config, run.sources, folder.read_spec(), chosen)
+        for member, place, num_bytes in zip(chosen, places, progress.metrics_bytes, strict=True):
+            source = folder.member_path(run.members[place].name)
+            goal = part.member_path(member.name)
+            goal.mkdir(exist_ok=True)
+            metrics = folder.metrics_path(run.members[place].name)
+            if metrics.exists():
+                part.metrics_path(member.name).write_bytes(metrics.read_bytes()[:num_bytes])
+            if (source / "best").is_dir():
+                shutil.copytree(source / "best", goal / "best")
+        with CheckpointWriter(part, config, block_axes) as writer:
+            writer.save(state, policy_of(state), progress)
+        os.rename(part.path, target.path)
+    except OSError as error:
+        raise CheckpointError(
+            f"to={str(target.path)!r} cannot be written ({first_line(error)}): choose a folder "
+            "that can, or try again where the run is being trained"
+        ) from error
+    finally:
+        shutil.rmtree(part.path, ignore_errors=True)
     return target.path
+
+
+def _check_new(path: Path) -> None:
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise CheckpointError(
+            f"to={str(path)!r} holds a run already, or something else: choose a new folder"
+        )
 
 
 def _config_of(config: Config, members: Sequence[Member]) -> Config:

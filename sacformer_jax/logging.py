@@ -36,7 +36,8 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ from tensorboardX import SummaryWriter
 from tensorboardX.summary import hparams
 
 Record = dict[str, Any]
+
+_LONG_QUEUE = 100_000
 
 
 def plain(value: Any) -> Any:
@@ -63,23 +66,91 @@ class _Log:
         self._file = path.open("r+b" if path.exists() else "wb")
         self._file.truncate(keep_bytes)
         self._file.seek(0, 2)
-        self._writer = SummaryWriter(
-            str(tensorboard_dir),
-            purge_step=0 if purge_after is None else purge_after + 1,
-            filename_suffix=f".{path.stem}",
-        )
+        purge_step = 0 if purge_after is None else purge_after + 1
+        self._events = _Events(tensorboard_dir, purge_step, f".{path.stem}")
 
     def _append(self, tag: str, record: Record) -> None:
         self._file.write(json.dumps(record).encode() + b"\n")
         self._file.flush()
-        for name, value in record.items():
-            if isinstance(value, int | float) and name not in ("env_steps", "updates"):
-                self._writer.add_scalar(f"{tag}/{name}", value, record["env_steps"])
+        numbers = {
+            f"{tag}/{name}": value
+            for name, value in record.items()
+            if isinstance(value, int | float) and name not in ("env_steps", "updates")
+        }
+        self._events.add(numbers, record["env_steps"])
 
     def close(self) -> None:
         """Flushes and closes all files."""
-        self._file.close()
-        self._writer.close()
+        try:
+            self._file.close()
+        finally:
+            self._events.close()
+
+
+class _Events:
+    """TensorBoard's file of events. It is a convenience: where it cannot be written, that is said
+    once, and everything is in the JSONL file all the same.
+    """
+
+    def __init__(self, folder: Path, purge_step: int, suffix: str):
+        self._folder = folder
+        self._writer: SummaryWriter | None = None
+
+        def open_() -> None:
+            # A queue that no chunk fills: nobody would empty it after its thread died.
+            self._writer = SummaryWriter(
+                str(folder), purge_step=purge_step, filename_suffix=suffix, max_queue=_LONG_QUEUE
+            )
+
+        self._guarded(open_)
+
+    def add(self, numbers: Record, env_steps: int) -> None:
+        """Adds numbers by name."""
+
+        def add_scalars(writer: SummaryWriter) -> None:
+            for name, value in numbers.items():
+                writer.add_scalar(name, value, env_steps)
+
+        self._write(add_scalars)
+
+    def add_settings(self, settings: Record) -> None:
+        """Adds what the page of hyperparameters shows."""
+
+        def add_summaries(writer: SummaryWriter) -> None:
+            # Into the same file as the metrics; the writer's own method would begin another run.
+            for summary in hparams(settings, {"eval/return_mean": None}):
+                writer.file_writer.add_summary(summary)
+
+        self._write(add_summaries)
+
+    def close(self) -> None:
+        """Flushes and closes the file."""
+        self._write(lambda writer: writer.close())
+
+    def _write(self, do: Callable[[SummaryWriter], None]) -> None:
+        writer = self._writer
+        if writer is None:
+            return
+        events = writer.file_writer.event_writer
+        if not events._worker.is_alive():  # an error of the disk ends it, which nobody is told
+            events._event_queue.cancel_join_thread()
+            self._given_up("its writer has died, as on a full disk")
+            return
+        self._guarded(lambda: do(writer))
+
+    def _guarded(self, do: Callable[[], None]) -> None:
+        try:
+            do()
+        except OSError as error:
+            self._given_up(str(error.strerror or error))
+
+    def _given_up(self, why: str) -> None:
+        self._writer = None
+        warnings.warn(
+            f"TensorBoard: {self._folder} cannot be written ({why}); training goes on, and "
+            "everything is in the JSONL file",
+            stacklevel=2,
+        )
 
 
 class MetricLog(_Log):
@@ -115,9 +186,7 @@ class MetricLog(_Log):
             name: value if isinstance(value, plain_types) else str(value)
             for name, value in settings.items()
         }
-        # Into the same file as the metrics; the writer's own method would begin another run.
-        for summary in hparams(shown, {"eval/return_mean": None}):
-            self._writer.file_writer.add_summary(summary)
+        self._events.add_settings(shown)
 
     @property
     def num_bytes(self) -> int:

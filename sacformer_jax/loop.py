@@ -94,8 +94,8 @@ class Loop:
         """
         with self.reporter.timed("compiling train_chunk"):
             train_chunk = self.population.train_chunk.lower(state).compile()
-        with ExitStack() as stack:
-            try:
+        try:
+            with ExitStack() as stack:
                 self._open_logs(stack)
                 writer = stack.enter_context(
                     CheckpointWriter(
@@ -106,11 +106,11 @@ class Loop:
                     )
                 )
                 env_steps = self._chunks(state, train_chunk, writer)
-            except OSError as error:
-                raise CheckpointError(
-                    f"run {str(self.folder.path)!r} cannot be written ({error.strerror}): what "
-                    f"was saved is intact; make room, then 'sacformer resume {self.folder.path}'"
-                ) from error
+        except OSError as error:  # also of files that are closed
+            raise CheckpointError(
+                f"run {str(self.folder.path)!r} cannot be written ({error.strerror}): what "
+                f"was saved is intact; make room, then 'sacformer resume {self.folder.path}'"
+            ) from error
         self.callbacks.raise_error()
         return env_steps
 
@@ -172,8 +172,7 @@ class Loop:
                         reporter.say(f"{error}; training goes on")
                 if len(self.failed) == len(self.names):
                     break
-        self._save(writer, state)
-        writer.wait()
+            self._save_for_good(writer, state)
         if len(self.failed) == len(self.names):
             raise DivergedError(
                 f"run {str(self.folder.path)!r} stopped at {env_steps:,} env steps: in every "
@@ -238,7 +237,7 @@ class Loop:
         result = self.population.evaluate(policies, np.int32(env_steps))
         result, counters = gathered((result, state.counters))
         records: dict[str, Record] = {}
-        improved = []
+        improved, before = [], list(self.best)
         for index, name in enumerate(self.names):
             record = summarize(jax.tree.map(lambda values, i=index: values[i], result))
             updates = int(member_counters(counters, index).updates)
@@ -253,16 +252,28 @@ class Loop:
                 improved.append(index)
         self.reporter.evaluated(env_steps, list(records.values()))
         if improved:
-            self._save_best(improved, gathered(policies))
+            self._save_best(improved, gathered(policies), before)
         self.callbacks.evaluation(state, records)
 
-    def _save_best(self, improved: list[int], policies: PolicyState) -> None:
-        """Writes the policies of those members, ``policies`` being everybody's."""
+    def _save_best(
+        self, improved: list[int], policies: PolicyState, before: list[BestSoFar | None]
+    ) -> None:
+        """Writes the policies of those members, ``policies`` being everybody's.
+
+        One that cannot be written leaves the one ``before`` the best: no checkpoint is to refer to
+        a policy that is not there, and the next that is better is tried again.
+        """
         for index in improved:
-            best = self.best[index]
+            best, failed = self.best[index], False
             if is_first() and best is not None:
                 policy = jax.tree.map(lambda leaf, i=index: leaf[i], policies)
-                save_best(self.folder, self.names[index], policy, best)
+                try:
+                    save_best(self.folder, self.names[index], policy, best)
+                except CheckpointError as error:
+                    failed = True
+                    self.reporter.say(f"{error}; training goes on")
+            if any_process(failed):
+                self.best[index] = before[index]
 
     def _save(self, writer: CheckpointWriter, state: TrainState) -> None:
         progress = Progress(
@@ -270,7 +281,19 @@ class Loop:
             best=tuple(self.best),
             metrics_bytes=tuple(log.num_bytes for log in self._logs),
         )
-        writer.save(self.population.stored(state), policy_of(state), progress)
+        failed = writer.save(self.population.stored(state), policy_of(state), progress)
+        if failed is not None:
+            self.reporter.say(f"{failed}; training goes on")
+
+    def _save_for_good(self, writer: CheckpointWriter, state: TrainState) -> None:
+        """Saves, and waits until it is on disk; what fails is tried once more."""
+        try:
+            self._save(writer, state)
+            writer.wait()
+        except CheckpointError as error:
+            self.reporter.say(f"{error}; trying once more")
+            self._save(writer, state)
+            writer.wait()
 
 
 def _crossed(every: int, before: int, now: int) -> bool:

@@ -17,6 +17,7 @@ from sacformer_jax import normalizer
 from sacformer_jax.buffer import TrajectoryBuffer
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.envs.core import EnvSpec
+from sacformer_jax.envs.wrapping import UNWRAPPED
 from sacformer_jax.population import Population
 from sacformer_jax.types import BufferState, TrainState, Transition
 
@@ -83,6 +84,11 @@ def check_episodes(episodes: Sequence[Episode], spec: EnvSpec, config: Config) -
     dataset = f"dataset={config.offline.dataset!r}"
     if not episodes:
         raise ConfigError(f"{dataset}: holds no episodes")
+    if spec.wrapping != UNWRAPPED:
+        raise ConfigError(
+            f"{dataset}: its steps are of the task as it is, but env={spec.name} has wrappers "
+            f"({', '.join(spec.wrapping.words())}); use an environment without any"
+        )
     low, high = np.array(spec.action_low), np.array(spec.action_high)
     slack = _SLACK * (high - low) / 2
     for number, episode in enumerate(episodes):

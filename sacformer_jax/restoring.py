@@ -58,7 +58,7 @@ def restore_newest(
       shardings: of the state, or None.
       move_aside: what is damaged, or only pass over it.
     """
-    moved: list[str] = []
+    damaged: list[tuple[Path, str]] = []
     steps = stored.steps_in(run / "checkpoints")
     while (step := processes.of_the_first(steps.pop() if steps else None)) is not None:
         path = run / "checkpoints" / str(step)
@@ -66,12 +66,16 @@ def restore_newest(
             metadata, state = _read(path, config, abstract, block_axes, shardings)
             stored.check_digests("state", metadata, state)
         except DamagedError as error:
-            line = f"checkpoint {path} is damaged ({error})"
-            if move_aside:
-                line += f": moved to {_move_aside(path, run / 'damaged', str(error))}"
-            moved.append(line)
+            damaged.append((path, str(error)))
             continue
         progress = Progress.from_dict(metadata["progress"])
+        # Not before there is another: a folder without checkpoints is a run that has none yet, and
+        # would start from the beginning.
+        moved = [
+            _told(path, reason)
+            + (f": moved to {_move_aside(path, run / 'damaged', reason)}" if move_aside else "")
+            for path, reason in damaged
+        ]
         return Restored(
             state=state,
             progress=progress,
@@ -79,11 +83,17 @@ def restore_newest(
             devices=metadata.get("devices") or {},
             moved_aside=tuple(moved),
         )
-    if moved:
+    if damaged:
+        told = "; ".join(_told(path, reason) for path, reason in damaged)
         raise CheckpointError(
-            f"run {str(run)!r} has no checkpoint left that is good: " + "; ".join(moved)
+            f"run {str(run)!r} has no checkpoint left that is good: {told}. All are still there: "
+            "put one back from a copy, or train in a new folder"
         )
     raise CheckpointError(f"run {str(run)!r} has no checkpoint yet: start it again in a new folder")
+
+
+def _told(path: Path, reason: str) -> str:
+    return f"checkpoint {path} is damaged ({reason})"
 
 
 def _read(
@@ -124,7 +134,7 @@ def _move_aside(path: Path, folder: Path, reason: str) -> Path:
             os.rename(path, target)
         except OSError as error:
             raise CheckpointError(
-                f"checkpoint {path} is damaged ({reason}) and cannot be moved to {target} "
+                f"{_told(path, reason)} and cannot be moved to {target} "
                 f"({error.strerror}): make the folder writable"
             ) from error
     processes.all_here()

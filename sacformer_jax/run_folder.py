@@ -115,7 +115,7 @@ class RunFolder:
                 # Left by a run that was stopped before its first checkpoint.
                 if (path / "best").exists():
                     shutil.rmtree(path / "best")
-            _write_whole(self.path / "config.json", json.dumps(contents, indent=2) + "\n")
+            write_whole(self.path / "config.json", json.dumps(contents, indent=2) + "\n")
         except OSError as error:
             raise CheckpointError(
                 f"run_dir={str(self.path)!r} cannot be written ({error.strerror}): "
@@ -201,7 +201,7 @@ class RunFolder:
         return restore_newest(self.path, config, abstract_state, block_axes, shardings, move_aside)
 
 
-def _write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Writes a file so that at any moment there is the old one or the new one."""
     new = path.with_name(path.name + ".new")
     with open(new, "w") as file:

@@ -162,8 +162,10 @@ def resume(
                         f"note: saved with {before} {what}, continued with {now[what]}: right, but "
                         "not bit for bit the same"
                     )
-            progress = restored.progress
-            return _train_on(population, folder, reporter, callbacks, state, progress)
+            progress, env_steps = restored.progress, int(state.counters.env_steps)
+            return _train_on(
+                population, folder, reporter, callbacks, env_steps, progress, lambda: state
+            )
 
     return _alone_in(folder, go_on)
 
@@ -236,8 +238,9 @@ def _start(
     episodes: Sequence[Episode],
 ) -> RunResult:
     """Trains from the start, the replay holding ``episodes``."""
-    config = population.config
-    with Reporter(quiet or not is_first()) as reporter:
+    config, reporter = population.config, Reporter(quiet or not is_first())
+
+    def started() -> TrainState:
         # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
         # then compile to the same programs, and resuming finds them in the compilation cache.
         state = jax.device_put(population.init(), population.shardings)
@@ -256,7 +259,13 @@ def _start(
                     f"context_length={config.context.context_length} steps finished in it; use "
                     "more, or a smaller context_length"
                 )
-        return _train_on(population, folder, reporter, callbacks, state, None)
+        return state
+
+    prefilled = 0
+    if population.num_drawable is not None:
+        prefilled = config.prefill_vector_steps * config.task.num_envs
+    with reporter:
+        return _train_on(population, folder, reporter, callbacks, prefilled, None, started)
 
 
 def _train_on(
@@ -264,20 +273,21 @@ def _train_on(
     folder: RunFolder,
     reporter: Reporter,
     given: Sequence[Callback],
-    state: TrainState,
+    env_steps: int,
     progress: Progress | None,
+    state_of: Callable[[], TrainState],
 ) -> RunResult:
+    """Trains from ``env_steps`` on; the state there is asked for once no callback refuses."""
     every, own = population.config.run.video_every, []
     if every:
         own.append(VideoEvery(every, say=reporter.say))
     callbacks, result = Callbacks([*given, *own], population, folder.path), None
     sources = folder.read_config().sources
-    callbacks.start(int(state.counters.env_steps), progress is not None, sources)
+    callbacks.start(env_steps, progress is not None, sources)
     try:
         callbacks.raise_error()
         loop = Loop(population, folder, reporter, callbacks, progress)
-        env_steps = loop.run(state)
-        result = _finished(population, folder, reporter, loop, env_steps)
+        result = _finished(population, folder, reporter, loop, loop.run(state_of()))
     finally:
         callbacks.end(result)
     return result
@@ -296,10 +306,16 @@ def _finished(
         for name, rows in records.items()
     }
     if is_first():
-        for name, own in records.items():
-            for kind in ("train", "eval"):
-                write_csv(own, kind, folder.member_path(name) / f"{kind}.csv")
-        draw_records(RunRecords(folder, folder.read_config(), records), folder.path)
+        try:
+            for name, own in records.items():
+                for kind in ("train", "eval"):
+                    write_csv(own, kind, folder.member_path(name) / f"{kind}.csv")
+            draw_records(RunRecords(folder, folder.read_config(), records), folder.path)
+        except OSError as error:
+            reporter.say(
+                f"note: tables and pictures in {folder.path} cannot be written ({error.strerror}); "
+                f"the run is saved; make room, then 'sacformer plot {folder.path}'"
+            )
     over = env_steps >= population.config.run.total_env_steps
     reporter.closing(loop.started, folder, env_steps, not over, evaluations)
     several = len(records) > 1

@@ -20,8 +20,8 @@ def stop_on_signal(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 
     def ask(number: int, frame: Any) -> None:
         asked.append(number)
+        restore()  # first of all: what cannot be said must not keep the second from acting
         say("stopping after this chunk, then saving; once more to stop at once")
-        restore()
 
     try:
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import errno
 import gc
 import hashlib
 import inspect
@@ -209,6 +210,10 @@ def _may_complain(thing: Any) -> bool:
     return type(thing) is tensorstore.Future
 
 
+_NOT_DAMAGE = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE}
+"""Errors that say nothing about what is in a file: the same read may succeed another time."""
+
+
 # --- metadata ------------------------------------------------------------------------------------
 
 
@@ -252,10 +257,10 @@ def read_metadata(step_path: Path) -> dict[str, Any]:
     try:
         metadata = json.loads((step_path / "metadata" / "metadata").read_text())
         digest = metadata.pop("digest")
-    except PermissionError as error:
-        reason = one_line(error)
-        raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, OSError) and error.errno in _NOT_DAMAGE:
+            reason = one_line(error)
+            raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
         raise DamagedError("its metadata cannot be read") from error
     if _seal(metadata) != digest:
         raise DamagedError("the digest of its metadata differs")
@@ -328,7 +333,8 @@ def read_item(
         reason, cause = one_line(error), _root(error)
         others = (MemoryError, PermissionError, jax.errors.JaxRuntimeError)
         statuses = "PERMISSION_DENIED|RESOURCE_EXHAUSTED"
-        if isinstance(cause, others) or re.search(statuses, str(cause)):
+        passing = _system_error(cause) in _NOT_DAMAGE
+        if passing or isinstance(cause, others) or re.search(statuses, str(cause)):
             raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
         raise DamagedError(f"its {item} cannot be read: {reason}") from error
 
@@ -368,12 +374,19 @@ def one_line(error: BaseException) -> str:
     error = _root(error)
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    text = str(error)
     # TensorStore's messages go on for pages; what the system said is inside.
-    if system := re.search(r"(?:OS error |os_error_code=')(\d+)", text):
-        return os.strerror(int(system.group(1)))
-    lines = re.split(r"[.\s]*See full TensorStore details", text)[0].strip().splitlines()
+    if (number := _system_error(error)) is not None:
+        return os.strerror(number)
+    lines = re.split(r"[.\s]*See full TensorStore details", str(error))[0].strip().splitlines()
     return lines[0][:200] if lines else type(error).__name__
+
+
+def _system_error(error: BaseException) -> int | None:
+    """The operating system's number of an error, which TensorStore has in its text."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno
+    found = re.search(r"(?:OS error |os_error_code=')(\d+)", str(error))
+    return int(found.group(1)) if found else None
 
 
 def _root(error: BaseException) -> BaseException:

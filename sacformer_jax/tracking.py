@@ -18,9 +18,11 @@ from sacformer_jax.callbacks import Callback, Event, RunStart
 from sacformer_jax.config import ConfigError
 from sacformer_jax.logging import Record
 from sacformer_jax.results import RunResult
+from sacformer_jax.run_folder import write_whole
 from sacformer_jax.values import first_line
 
 WandbMode = Literal["online", "offline"]
+_FILE = "wandb.json"
 _NOT_METRICS = ("kind", "env_steps", "updates", "member")
 
 
@@ -150,13 +152,14 @@ class WandbTracker(Callback):
 
     def _ids(self, run: RunStart) -> dict[str, str]:
         """An id of theirs for each member, kept in the run's folder."""
-        path = run.path / "wandb.json"
-        known = json.loads(path.read_text()) if path.exists() and run.resumed else {}
-        ids = known.get("ids", {})
+        path = run.path / _FILE
+        known = _remembered(path) if path.exists() and run.resumed else {}
+        ids = dict(known.get("ids", {}))
         for member in run.members:
             ids.setdefault(member.name, secrets.token_hex(4))
         chosen = {"project": self.project, "entity": self.entity, "mode": self.mode}
-        path.write_text(json.dumps({**chosen, "ids": ids}, indent=2) + "\n")
+        if known != {**chosen, "ids": ids}:
+            write_whole(path, json.dumps({**chosen, "ids": ids}, indent=2) + "\n")
         return ids
 
 
@@ -165,12 +168,26 @@ def resumed_tracking(path: Path) -> list[Callback]:
 
     Args:
       path: the run's folder.
+
+    Raises:
+      ConfigError: what the run remembers of them cannot be read.
     """
-    file = path / "wandb.json"
+    file = path / _FILE
     if not file.exists():
         return []
-    known = json.loads(file.read_text())
+    known = _remembered(file)
     return Tracking(known["project"], known["entity"], known["mode"]).callbacks()
+
+
+def _remembered(file: Path) -> dict[str, Any]:
+    """Project, entity, mode and ids."""
+    try:
+        known = json.loads(file.read_text())
+        return {name: known[name] for name in ("project", "entity", "mode", "ids")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{file} is damaged ({first_line(error)}): remove it to go on without Weights & Biases"
+        ) from error
 
 
 def _named(kind: str, record: Record) -> Record:

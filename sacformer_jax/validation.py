@@ -176,6 +176,11 @@ def _check_policy(config: Config) -> None:
         "tune_alpha=True: policy=deterministic has no entropy to tune it by; use "
         "tune_alpha=False, or policy=gaussian",
     )
+    _require(
+        config.agent not in ("td3", "ddpg") or not config.learning.tune_alpha,
+        f"tune_alpha=True: agent={config.agent} has no entropy to tune it by; use "
+        "tune_alpha=False, or agent=sacformer or sac",
+    )
 
 
 def _check_past_in_training(
@@ -346,6 +351,12 @@ def _check_acting(config: Config) -> None:
     context, limit = config.context, config.context.acting_context_limit
     _require(limit is None or limit >= 1, f"acting_context_limit={limit}: must be at least 1")
     if context.acting_context == "window":
+        _require(
+            limit is None,
+            f"acting_context_limit={limit}: acting_context=window shows context_length="
+            f"{context.context_length} states; use acting_context_limit=None, or "
+            "acting_context=episode",
+        )
         return
     _require(
         config.agent not in MLP_AGENTS,
@@ -405,6 +416,12 @@ def _check_offline(config: Config) -> None:
         offline.pretrain_updates == 0 or config.agent in ("sacformer", "sac"),
         f"pretrain_updates={offline.pretrain_updates}: agent={config.agent} can only begin with "
         "the dataset in its replay; use pretrain_updates=0, or agent=sacformer or sac",
+    )
+    _require(
+        offline.pretrain_updates == 0 or config.run.prefill_env_steps == 0,
+        f"prefill_env_steps={config.run.prefill_env_steps}: pretrain_updates would imitate these "
+        "random actions with those of the dataset, which fills the replay by itself; use "
+        "prefill_env_steps=0",
     )
     _require(
         config.run.checkpoint_replay,

@@ -24,11 +24,13 @@ from sacformer_jax import (
     StopWithoutProgress,
     load_policy,
     resume,
+    runner,
     train,
 )
 from sacformer_jax.callbacks import Callbacks
 from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
+from sacformer_jax.population import Population, make_population
 from sacformer_jax.run_folder import RunFolder
 
 TOTAL = 600
@@ -216,11 +218,20 @@ def test_an_error_ends_the_run_after_it_was_saved(tmp_path: Path) -> None:
     assert RunFolder(tmp_path / "run").latest_step() == 400
 
 
-def test_an_error_at_the_start_comes_before_anything_is_computed(tmp_path: Path) -> None:
+def test_an_error_at_the_start_comes_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Failing(Callback):
         def on_start(self, run: RunStart) -> None:
             raise ValueError(f"not in {run.path.name}")
 
+    def begun(*_: Any) -> None:
+        pytest.fail("something is computed")
+
+    def made(*arguments: Any) -> Population:
+        return dataclasses.replace(make_population(*arguments), prefill=begun)
+
+    monkeypatch.setattr(runner, "make_population", made)
     seen = Recorder()
     with pytest.raises(ValueError, match="not in run"):
         train(_config(tmp_path / "run"), quiet=True, callbacks=[Failing(), seen])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -449,6 +450,30 @@ def test_a_full_disk_harms_nothing_that_is_there(
         progress = dataclasses.replace(progress, env_steps=500)
         writer.save(state, policy_of(state), progress)
     assert checkpoint_names(copy) == ["400", "500"]
+    assert digest(copy.restore(abstract).state) == digest(state)
+
+
+def test_a_save_that_failed_does_not_take_the_next_with_it(
+    copy: RunFolder,
+    program: Program,
+    states: dict[int, TrainState],
+    abstract: TrainState,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    state, progress = states[OLD], dataclasses.replace(PROGRESS[OLD], env_steps=400)
+    with CheckpointWriter(copy, program.config) as writer:
+        with monkeypatch.context() as patch:
+            patch.setattr(*FAILING["in the background"])
+            assert writer.save(state, policy_of(state), progress) is None
+            assert writer._manager is not None
+            with contextlib.suppress(Exception):
+                writer._manager.wait_until_finished()
+        # There is space again before anybody has asked what became of it.
+        progress = dataclasses.replace(progress, env_steps=500)
+        failed = writer.save(state, policy_of(state), progress)
+        assert "400 could not be saved" in str(failed)
+        writer.wait()
+        assert copy.latest_step() == 500
     assert digest(copy.restore(abstract).state) == digest(state)
 
 

@@ -8,6 +8,7 @@ import errno
 import gc
 import json
 import logging
+import os
 import shutil
 import sys
 import threading
@@ -181,15 +182,48 @@ def test_the_leaf_that_differs_is_named(copy: RunFolder, abstract: TrainState) -
 
 
 def test_when_all_are_damaged_that_is_what_it_says(copy: RunFolder, abstract: TrainState) -> None:
+    """Each time it is asked: without checkpoints it would be a run that starts from the beginning,
+    over its metrics and best policies.
+    """
     for step in (OLD, NEW):
         cut(metadata_file(copy.path / "checkpoints" / str(step)), 0.3)
-    with pytest.raises(CheckpointError) as refused:
-        copy.restore(abstract)
-    message = message_of(refused)
-    assert "no checkpoint left that is good" in message
-    for step in (OLD, NEW):
-        assert str(copy.path / "damaged" / str(step)) in message
-        assert (copy.path / "damaged" / str(step)).is_dir()
+    before = contents_of(copy.path)
+    for _ in range(2):
+        with pytest.raises(CheckpointError) as refused:
+            copy.restore(abstract)
+        message = message_of(refused)
+        assert "no checkpoint left that is good" in message
+        for step in (OLD, NEW):
+            assert str(copy.path / "checkpoints" / str(step)) in message
+    assert contents_of(copy.path) == before
+    assert copy.latest_step() == NEW
+
+
+@pytest.mark.parametrize("what", ["metadata", "arrays"])
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ESTALE, errno.EACCES])
+def test_what_may_be_read_another_time_is_not_damaged(
+    copy: RunFolder, abstract: TrainState, monkeypatch: pytest.MonkeyPatch, number: int, what: str
+) -> None:
+    read = Path.read_text
+
+    def read_text(path: Path, *arguments: Any) -> str:
+        if path.name == "metadata":
+            raise OSError(number, os.strerror(number))
+        return read(path, *arguments)
+
+    def restore(*_: Any, **__: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        if what == "metadata":
+            patch.setattr(Path, "read_text", read_text)
+        else:
+            patch.setattr(ocp.StandardCheckpointHandler, "restore", restore)
+        with pytest.raises(CheckpointError, match="cannot be read") as refused:
+            copy.restore(abstract)
+    assert os.strerror(number) in message_of(refused)
+    assert checkpoint_names(copy) == [str(OLD), str(NEW)]
+    assert not copy.restore(abstract).moved_aside
 
 
 def test_a_step_damaged_twice_is_kept_twice(

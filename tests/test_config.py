@@ -407,6 +407,16 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"acting_context_limit": 5, "acting_context": "episode"}, "context_length=6"),
     ({"policy": "categorical"}, "policy='categorical'"),
     ({"tune_alpha": True, "policy": "deterministic"}, "no entropy"),
+    (
+        {
+            "tune_alpha": True,
+            "agent": "td3",
+            "context_length": 1,
+            "return_conditioning": "none",
+        },
+        "agent=td3 has no entropy",
+    ),
+    ({"acting_context_limit": 24}, "acting_context=window shows context_length=6"),
     ({"action_noise": -0.1}, "action_noise=-0.1"),
     ({"action_noise_clip": 0.0}, "action_noise_clip=0.0"),
     ({"policy_delay": 0}, "policy_delay=0"),

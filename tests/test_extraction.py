@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -113,8 +115,28 @@ def test_what_cannot_be_taken_out(seeds: Path, swept: Path, tmp_path: Path) -> N
     assert not to.exists()
     with pytest.raises(CheckpointError, match="holds a run already"):
         extract(seeds, [0], swept)
+    begun = tmp_path / "begun"  # of a run that has no checkpoint yet
+    begun.mkdir()
+    (begun / "config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match="holds a run already"):
+        extract(seeds, [0], begun)
+    assert (begun / "config.json").read_text() == "{}"
     with pytest.raises(ConfigError, match="several; say which: seed-5, seed-0, seed-2"):
         load_policy(seeds)
+
+
+def test_a_run_that_cannot_be_written_as_a_whole_is_not_there(
+    seeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without its checkpoint it would be a run that starts from the beginning."""
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copytree", full)
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        extract(seeds, [0], tmp_path / "to")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_from_the_command_line(

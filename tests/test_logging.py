@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import threading
+import warnings
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tensorboardX.event_file_writer import EventsWriter
 
 from sacformer_jax.logging import MetricLog, TimingLog, plain, read_records, write_csv
 
@@ -183,6 +187,40 @@ def test_tensorboard_holds_the_scalars(tmp_path: Path) -> None:
         (events,) = (f for f in (tmp_path / "tensorboard" / folder).iterdir() if f.is_file())
         assert tag in events.read_bytes()
         assert b"env_steps" not in events.read_bytes()  # it is the axis
+
+
+def test_a_disk_that_is_full_costs_tensorboard_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its thread dies of that, and everything else would wait for it for good."""
+
+    def full(writer: EventsWriter, event: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    log = _open(tmp_path)
+    events = log._events._writer.file_writer.event_writer
+    monkeypatch.setattr(threading, "excepthook", lambda hook: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(EventsWriter, "write_event", full)
+        log.write("train", 0, 0, {"critic_loss": 0.0})
+        events._worker.join(20)
+    assert not events._worker.is_alive()
+    with pytest.warns(UserWarning, match="TensorBoard: .*cannot be written"):
+        log.write("train", 1, 1, {"critic_loss": 1.0})
+    with warnings.catch_warnings(action="error"):  # that is said once
+        for step in range(2, 50):
+            log.write("train", step, step, {"critic_loss": float(step)})
+        log.close()
+    assert len(_lines(tmp_path / "metrics.jsonl")) == 50
+
+
+def test_a_folder_that_tensorboard_cannot_have(tmp_path: Path) -> None:
+    (tmp_path / "tensorboard").write_text("in the way")
+    with pytest.warns(UserWarning, match="TensorBoard: .*cannot be written"):
+        log = _open(tmp_path, settings={"tau": 0.1})
+    log.write("train", 1, 1, {"critic_loss": 1.0})
+    log.close()
+    assert len(_lines(tmp_path / "metrics.jsonl")) == 1
 
 
 def test_read_records_by_kind(tmp_path: Path) -> None:

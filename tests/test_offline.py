@@ -356,6 +356,10 @@ def test_a_run_from_a_dataset_resumes_as_if_never_stopped(dataset: Path, tmp_pat
         ({"pretrain_updates": -1}, "pretrain_updates=-1: must not be negative"),
         ({"dataset": "x", "agent": "ppo"}, "agent=ppo learns from its own steps alone"),
         ({"dataset": "x", "agent": "td3", "pretrain_updates": 5}, "agent=td3 can only begin"),
+        (
+            {"dataset": "x", "pretrain_updates": 5, "prefill_env_steps": 400},
+            "prefill_env_steps=400: pretrain_updates would imitate these random actions",
+        ),
         ({"dataset": "x", "checkpoint_replay": False}, "checkpoint_replay=False does not save"),
     ],
 )

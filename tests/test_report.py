@@ -157,6 +157,7 @@ def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
     folder = _run(tmp_path / "run")
     (folder.path / "videos").mkdir()
     (folder.path / "videos" / "step_2000.mp4").write_bytes(b"a video")
+    (folder.path / "videos" / ".step_3000.new.mp4").write_bytes(b"half of one")
     text = report([folder.path]).read_text()
     page = _Page(text)
     assert all(source.startswith("data:") for source in page.sources)

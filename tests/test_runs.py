@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import io
 import json
 import re
@@ -32,10 +33,11 @@ from sacformer_jax import (
     runner,
     train,
 )
-from sacformer_jax.checkpoint import Restored, RunFolder
+from sacformer_jax.checkpoint import CheckpointWriter, Restored, RunFolder
 from sacformer_jax.cores import xla_threads
 from sacformer_jax.digests import digest
-from sacformer_jax.logging import read_records
+from sacformer_jax.logging import MetricLog, read_records
+from sacformer_jax.stored import read_metadata
 from sacformer_jax.train import hyperparameters, policy_state
 from sacformer_jax.types import Context
 
@@ -369,6 +371,70 @@ def test_an_evaluation_that_physics_cut_off_is_not_the_best(
     path = tmp_path / "run"
     train(Config.from_preset("cpu", **TINY, run_dir=str(path)), quiet=True)
     assert [p.name for p in (path / "best").iterdir()] == ["400"]
+
+
+def test_what_cannot_be_written_once_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    returns = iter([10.0, 20.0, 30.0])  # at 200, 400 and 600 steps
+    best_saves, saves = [], []
+
+    def summarize(_: Any) -> dict[str, Any]:
+        return dict.fromkeys(EVAL_FIELDS, 0) | {"episodes": 2, "return_mean": next(returns)}
+
+    def save_best(*arguments: Any) -> None:
+        best_saves.append(arguments)
+        if len(best_saves) == 2:
+            raise CheckpointError("best policy 400 could not be saved")
+        save_best_as_it_is(*arguments)
+
+    def save(writer: CheckpointWriter, *arguments: Any) -> CheckpointError | None:
+        saves.append(arguments)
+        if len(saves) == 2:
+            raise CheckpointError("checkpoint 600 could not be saved")
+        return save_as_it_is(writer, *arguments)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    save_best_as_it_is, save_as_it_is = loop.save_best, CheckpointWriter.save
+    monkeypatch.setattr(loop, "summarize", summarize)
+    monkeypatch.setattr(loop, "save_best", save_best)
+    monkeypatch.setattr(CheckpointWriter, "save", save)
+    monkeypatch.setattr(runner, "draw_records", full)
+    path = tmp_path / "run"
+    result = train(Config.from_preset("cpu", **TINY, run_dir=str(path)))
+    assert result.env_steps == 600
+    said = capsys.readouterr().out
+    assert "best policy 400 could not be saved; training goes on" in said
+    assert "checkpoint 600 could not be saved; trying once more" in said
+    assert "cannot be written (No space left on device); the run is saved" in said
+    # No checkpoint refers to the policy that is not there.
+    best = {
+        step: read_metadata(path / "checkpoints" / str(step))["progress"]["best"][0]["env_steps"]
+        for step in RunFolder(path).steps()
+    }
+    assert best == {400: 200, 600: 600}
+    assert {p.name for p in (path / "best").iterdir()} == {"200", "600"}
+
+
+def test_a_full_disk_is_told_though_closing_fails_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    close = MetricLog.close
+
+    def close_and_fail(log: MetricLog) -> None:
+        close(log)
+        full()
+
+    monkeypatch.setattr(MetricLog, "write", full)
+    monkeypatch.setattr(MetricLog, "close", close_and_fail)
+    config = Config.from_preset("cpu", **TINY, run_dir=str(tmp_path / "run"))
+    with pytest.raises(CheckpointError, match=r"No space left on device\): .*make room"):
+        train(config, quiet=True)
 
 
 def test_learning_curve_is_a_png(straight: Outcome) -> None:

@@ -404,7 +404,7 @@ def test_of_a_delayed_action_all_steps_until_its_effect_are_foretold():
 )
 def test_what_is_foretold_reaches_as_far_as_the_delay(fields, steps):
     config = Config.from_preset("cpu", **{"prediction_weight": 1.0} | fields)
-    assert predicted_steps(config) == steps
+    assert predicted_steps(config, config.task.action_delay) == steps
 
 
 def test_a_transformer_may_learn_from_its_prediction_alone():

@@ -345,7 +345,7 @@ def test_preset_best_is_what_was_tuned() -> None:
         preset = Config.from_preset("best", env="Hopper", agent=agent)
         other = tuned[f"Hopper-{variant}"]
         # "effect" is a step where an action comes into effect at once.
-        assert predicted_steps(preset) == predicted_steps(other)
+        assert predicted_steps(preset, 0) == predicted_steps(other, 0)
         assert _differing(preset, other) - {"prediction_steps"} == {"preset", "seeds", "run_dir"}
 
 

@@ -75,6 +75,13 @@ def _offline() -> WandbTracker:
     return WandbTracker("testing", mode="offline")
 
 
+@pytest.mark.parametrize("left", ["", "{}", '{"project": "p"'])
+def test_what_is_remembered_of_it_and_damaged_is_named(tmp_path: Path, left: str) -> None:
+    (tmp_path / "wandb.json").write_text(left)
+    with pytest.raises(ConfigError, match=r"wandb\.json is damaged .*remove it to go on"):
+        resumed_tracking(tmp_path)
+
+
 def test_their_failures_do_not_stop_training(tmp_path: Path) -> None:
     class Breaking(Callback):
         """Breaks the tracker's connection after the first evaluation."""

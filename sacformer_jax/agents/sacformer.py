@@ -32,18 +32,23 @@ def make_actor(config: Config, spec: EnvSpec) -> TransformerActor:
         head_init_scale=settings.head_init_scale,
         tokens=config.context.tokens,
         state_path=(settings.state_path_width,) * 2 if settings.state_path_width else None,
-        predicts=predicted_steps(config),
+        predicts=predicted_steps(config, spec.wrapping.action_delay),
         given=settings.transformer_loss == "prediction",
     )
 
 
-def predicted_steps(config: Config) -> int:
-    """How many steps the actor foretells; 0: none."""
+def predicted_steps(config: Config, action_delay: int) -> int:
+    """How many steps the actor foretells; 0: none.
+
+    Args:
+      config: what to train.
+      action_delay: of the environment, steps. One that comes wrapped has its own.
+    """
     learning = config.learning
     if learning.prediction_weight == 0:
         return 0
     if learning.prediction_steps == "effect":
-        return min(1 + config.task.action_delay, config.context.steps_in_a_row)
+        return min(1 + action_delay, config.context.steps_in_a_row)
     return learning.prediction_steps
 
 

@@ -22,7 +22,7 @@ from sacformer_jax.envs.physics import ENGINES, EngineChoice
 from sacformer_jax.envs.tasks import TASKS, Coordinates, Quantities, Task
 from sacformer_jax.envs.wrappers import ActionDelay, HiddenVelocities, StackedObs, Wrapper, wrapped
 from sacformer_jax.envs.wrapping import Wrapping
-from sacformer_jax.presets import TASK_LAYERS, Layer
+from sacformer_jax.presets import TASK_LAYERS, UNKNOWN_TARGET, Layer
 
 if TYPE_CHECKING:
     from sacformer_jax.envs.brax_view import BraxView
@@ -87,6 +87,7 @@ def make_env(
         :func:`check_env`.
     """
     choice = EngineChoice(engine, mjx_preset, mjx_impl)
+    _check_mjx(name, choice)
     if not isinstance(name, str):
         return as_env(name, choice)
     _check_choices(name, engine, brax_backend)
@@ -135,6 +136,21 @@ def _check_choices(name: str, engine: str, brax_backend: str) -> None:
         )
 
 
+def _check_mjx(name: str | Any, choice: EngineChoice) -> None:
+    """Refuses what says how MJX is to work where it does not; auto may find it."""
+    prefixes = (BRAX_PREFIX, GYM_PREFIX)
+    elsewhere = isinstance(name, str) and name.startswith(prefixes)
+    if not elsewhere and choice.engine != "native":
+        return
+    for field in ("mjx_preset", "mjx_impl"):
+        value, default = getattr(choice, field), getattr(EngineChoice, field)
+        if value != default:
+            raise ConfigError(
+                f"{field}={value!r}: is for engine=mjx, not "
+                f"{f'env={name!r}' if elsewhere else 'engine=native'}; use {default}"
+            )
+
+
 def as_brax(env: Env) -> BraxView:
     """An environment of ours as a ``brax.envs.Env``, for ``brax.training`` and its peers."""
     from sacformer_jax.envs.brax_view import as_brax
@@ -154,5 +170,10 @@ def _playground_layers(name: str) -> tuple[Layer, ...]:
     return task_layers(name)
 
 
+def _brax_layers(name: str) -> tuple[Layer, ...]:
+    return (UNKNOWN_TARGET,)
+
+
+TASK_LAYERS[BRAX_PREFIX] = _brax_layers
 TASK_LAYERS[GYM_PREFIX] = _gym_layers
 TASK_LAYERS[PLAYGROUND_PREFIX] = _playground_layers

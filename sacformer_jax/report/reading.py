@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -207,5 +208,11 @@ def _faults(folder: RunFolder, names: list[str], learning: list[list[Record]]) -
 
 
 def _newest_video(path: Path) -> Path | None:
-    videos = [*path.glob("*.mp4"), *path.glob("videos/*.mp4"), *path.glob("*/videos/*.mp4")]
-    return max(videos, key=lambda video: video.stat().st_mtime, default=None)
+    found = [*path.glob("*.mp4"), *path.glob("videos/*.mp4"), *path.glob("*/videos/*.mp4")]
+    times: dict[Path, float] = {}
+    for video in found:
+        if video.name.startswith("."):  # being drawn
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            times[video] = video.stat().st_mtime
+    return max(times, key=times.__getitem__, default=None)
