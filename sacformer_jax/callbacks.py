@@ -92,7 +92,7 @@ class Event:
         """A metric's mean over the members.
 
         Raises:
-          ConfigError: these records have no such metric.
+          ConfigError: these records have no such metric, or one of them has null.
         """
         values = [record.get(name) for record in self.records.values()]
         known = [value for value in values if isinstance(value, int | float)]
