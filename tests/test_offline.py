@@ -400,6 +400,12 @@ def test_episodes_of_another_task_are_refused(
         check_episodes(episodes, PointEnv().spec, config)
 
 
+def test_an_environment_that_comes_wrapped_takes_no_steps_of_the_task_as_it_is() -> None:
+    delayed = wrapped(PointEnv(), action_delay=1).spec
+    with pytest.raises(ConfigError, match=r"has wrappers \(.*\); use an environment without any"):
+        check_episodes(_episodes([4]), delayed, point_config(dataset="x"))
+
+
 def test_a_dataset_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     config = Config.from_preset("cpu", **TINY, dataset="none/such-v0", run_dir=str(tmp_path / "r"))

@@ -143,6 +143,7 @@ def test_the_environments_own_limit_is_the_default_and_no_return_is_made_up(name
     given = {"max_episode_steps": 7, "target_return": -1.0, "env": "probe:PointEnv"}
     config = Config.from_preset("cpu", **given)
     assert (config.task.max_episode_steps, config.context.target_return) == (7, -1.0)
+    assert resolve("cpu", {"env": "brax:ant"}).config.context.target_return == "auto"
     # Where no return is looked at there is no target, whoever said so.
     for preset, given in (("cpu", {"return_conditioning": "none"}), ("best", {}), ("memory", {})):
         unconditioned = resolve(preset, {"env": "probe:PointEnv", **given})

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 import pytest
 from gpt2 import gaussian_of
-from probe import point_config, point_env
+from probe import PointEnv, point_config, point_env
 
 from sacformer_jax import agents
 from sacformer_jax.agents import sacformer
@@ -25,6 +25,7 @@ from sacformer_jax.agents.sac_update import (
 from sacformer_jax.agents.sacformer import predicted_steps
 from sacformer_jax.config import Config
 from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
+from sacformer_jax.envs import wrapped
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.train import hyperparameters
@@ -405,6 +406,13 @@ def test_of_a_delayed_action_all_steps_until_its_effect_are_foretold():
 def test_what_is_foretold_reaches_as_far_as_the_delay(fields, steps):
     config = Config.from_preset("cpu", **{"prediction_weight": 1.0} | fields)
     assert predicted_steps(config, config.task.action_delay) == steps
+
+
+def test_what_is_foretold_reaches_as_far_as_the_delay_that_an_environment_comes_with():
+    config = point_config(**EFFECT, prediction_weight=1.0, context_length=K)
+    delayed = wrapped(PointEnv(), action_delay=2).spec
+    assert config.task.action_delay == 0
+    assert sacformer.make_actor(config, delayed).predicts == 3
 
 
 def test_a_transformer_may_learn_from_its_prediction_alone():

@@ -277,6 +277,16 @@ def test_unknown_engine_is_refused_with_what_there_is():
         ("gym:Pendulum-v1", {"engine": "mjx"}, "engine='mjx': env='gym:Pendulum-v1' has its own"),
         ("brax:ant", {"engine": "native"}, "chosen by brax_backend"),
         ("Hopper", {"brax_backend": "mjx"}, "brax_backend='mjx': is for env=brax:NAME"),
+        (
+            "Hopper",
+            {"engine": "native", "mjx_preset": "fast"},
+            "mjx_preset='fast': is for engine=mjx, not engine=native",
+        ),
+        (
+            "brax:ant",
+            {"mjx_impl": "warp"},
+            "mjx_impl='warp': .*, not env='brax:ant'",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             make_env(name, **choice)
