@@ -26,6 +26,7 @@ from sacformer_jax.agents.sacformer import predicted_steps
 from sacformer_jax.config import Config
 from sacformer_jax.critics import CriticInputs, MLPCritic, make_critics, twin
 from sacformer_jax.envs import wrapped
+from sacformer_jax.envs.wrapping import Wrapping
 from sacformer_jax.networks import TransformerActor
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.train import hyperparameters
@@ -383,7 +384,8 @@ def test_the_actor_learns_to_predict_as_far_as_that_weighs():
 
 
 def test_of_a_delayed_action_all_steps_until_its_effect_are_foretold():
-    window, key, spec = make_window(), jax.random.key(7), point_env(1).spec
+    window, key = make_window(), jax.random.key(7)
+    spec = dataclasses.replace(point_env(1).spec, wrapping=Wrapping(action_delay=1))
     fields = {"prediction_weight": 1.0, "prediction_steps": "effect", "action_delay": 1}
     params, _, _, loss = first_update(window, key, spec, **fields)
     actor = transformer(point_config(context_length=K), spec, predicts=2)
