@@ -22,4 +22,5 @@ def cpu_model() -> str:
 
 def cpu_with_cores(cores: int) -> str:
     """The processor, and how many of its cores a run had."""
-    return f"{cpu_model()}, {cores} core{'s' if cores > 1 else ''}"
+    model = cpu_model()
+    return model if model == UNKNOWN else f"{model}, {cores} core{'s' if cores > 1 else ''}"

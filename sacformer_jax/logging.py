@@ -46,7 +46,7 @@ from tensorboardX.summary import hparams
 
 Record = dict[str, Any]
 
-_LONG_QUEUE = 100_000
+_LONG_QUEUE = 32_767  # the most that macOS allows
 
 
 def plain(value: Any) -> Any:
