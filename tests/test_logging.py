@@ -203,7 +203,7 @@ def test_a_disk_that_is_full_costs_tensorboard_alone(
     monkeypatch.setattr(EventsWriter, "write_event", full)
 
     def write_until_it_is_seen() -> None:
-        log.write("train", 0, 0, {"critic_loss": 0.0})  # by when it may have died of its first event
+        log.write("train", 0, 0, {"critic_loss": 0.0})  # by now it may be dead already
         events._worker.join(20)
         log.write("train", 1, 1, {"critic_loss": 1.0})
 
