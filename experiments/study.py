@@ -106,6 +106,7 @@ class Study:
         cores = _cores()
         if not 1 <= args.jobs <= max(1, len(cores)):
             parser.error(f"--jobs {args.jobs}: must be from 1 to {max(1, len(cores))}, the cores")
+        rows = read_table(self.table)
         for name in names:
             try:
                 changed = self._changed(name)
@@ -116,7 +117,7 @@ class Study:
                     f"{self.runs / name} was trained with other settings ({', '.join(changed)}): "
                     "move it away to train anew"
                 )
-            if others := self._of_other_settings(name):
+            if others := self._of_other_settings(name, rows):
                 parser.error(
                     f"{self.table} has {', '.join(others)}, trained with other settings than "
                     f"{name} would be now, and counts them as the same: rename those runs, or take "
@@ -145,16 +146,16 @@ class Study:
         now, then = self.configs[name].flat(), folder.read_config().config.flat()
         return [field for field in now if field not in NOT_COMPARED and now[field] != then[field]]
 
-    def _of_other_settings(self, name: str) -> list[str]:
-        """Runs in the table that are seeds of the same variant on the same task, trained with other
-        settings. A run of this very name is not among them where it is to be trained anew.
+    def _of_other_settings(self, name: str, rows: Iterable[Row]) -> list[str]:
+        """Runs in the table's ``rows`` that are seeds of the same variant on the same task, trained
+        with other settings. A run of this very name is not among them: it is trained anew.
         """
         config = self.configs[name]
         digest = settings_digest(config)
         variant = variant_of({"run": name, "env": config.task.env, "seed": config.all_seeds[0]})
         others = {
             row["run"]
-            for row in read_table(self.table)
+            for row in rows
             if (row["env"], variant_of(row)) == (config.task.env, variant)
             and row["run"] != name
             and (row.get("settings") or digest) != digest

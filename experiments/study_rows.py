@@ -49,15 +49,14 @@ def rows_of(
         total += record["chunk_seconds"]
         seconds[record["env_steps"]] = total
     file = folder.read_config()
-    engine = folder.read_spec().engine
-    prefill = file.config.prefill_vector_steps * file.config.task.num_envs
+    engine, settings = folder.read_spec().engine, settings_digest(file.config)
 
     def trained_until(env_steps: int) -> float | str:
         """Seconds; nothing where that is not known, as records of a resumed run can be lost."""
         known = seconds.get(env_steps)
         if known is not None:
             return round(known, 1)
-        return 0.0 if env_steps <= prefill else ""
+        return 0.0 if env_steps <= file.config.env_steps_of_prefill else ""
 
     return [
         {
@@ -75,7 +74,7 @@ def rows_of(
             "wall_s": trained_until(record["env_steps"]),
             "commit": MORE.join(commits) or UNKNOWN,
             "cpu": MORE.join(cpus) or UNKNOWN,
-            "settings": settings_digest(file.config),
+            "settings": settings,
         }
         for member in file.members
         for record in read_records(folder.metrics_path(member.name), "eval")

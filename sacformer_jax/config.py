@@ -431,6 +431,11 @@ class Config:
         """Steps of all environments under random actions (rounded up)."""
         return -(-self.run.prefill_env_steps // self.task.num_envs)
 
+    @property
+    def env_steps_of_prefill(self) -> int:
+        """Environment steps that these are."""
+        return self.prefill_vector_steps * self.task.num_envs
+
     def validated(self) -> Config:
         """Itself, if it can work.
 

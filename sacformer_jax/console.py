@@ -34,8 +34,9 @@ class _Output(Console):
     def on_broken_pipe(self) -> None:
         """Prints nothing any more, where Rich would end the program."""
         self.quiet = True
-        with contextlib.suppress(OSError, ValueError):  # what Python flushes at its end, too
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+        # What Python flushes at its end, too.
+        with contextlib.suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), self.file.fileno())
 
     def _check_buffer(self) -> None:
         try:

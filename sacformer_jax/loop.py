@@ -237,7 +237,7 @@ class Loop:
         result = self.population.evaluate(policies, np.int32(env_steps))
         result, counters = gathered((result, state.counters))
         records: dict[str, Record] = {}
-        improved, before = [], list(self.best)
+        improved: dict[int, BestSoFar] = {}
         for index, name in enumerate(self.names):
             record = summarize(jax.tree.map(lambda values, i=index: values[i], result))
             updates = int(member_counters(counters, index).updates)
@@ -246,34 +246,29 @@ class Loop:
             records[name] = record
             best = self.best[index]
             if best is None or rank(record) > rank(dataclasses.asdict(best)):
-                self.best[index] = BestSoFar(
-                    env_steps, record["return_mean"], record["bad_physics"]
-                )
-                improved.append(index)
+                improved[index] = BestSoFar(env_steps, record["return_mean"], record["bad_physics"])
         self.reporter.evaluated(env_steps, list(records.values()))
         if improved:
-            self._save_best(improved, gathered(policies), before)
+            self._save_best(improved, gathered(policies))
         self.callbacks.evaluation(state, records)
 
-    def _save_best(
-        self, improved: list[int], policies: PolicyState, before: list[BestSoFar | None]
-    ) -> None:
+    def _save_best(self, improved: dict[int, BestSoFar], policies: PolicyState) -> None:
         """Writes the policies of those members, ``policies`` being everybody's.
 
-        One that cannot be written leaves the one ``before`` the best: no checkpoint is to refer to
-        a policy that is not there, and the next that is better is tried again.
+        One that cannot be written is not the best: no checkpoint is to refer to a policy that is
+        not there, and the next that is better is tried again.
         """
-        for index in improved:
-            best, failed = self.best[index], False
-            if is_first() and best is not None:
+        for index, best in improved.items():
+            failed = False
+            if is_first():
                 policy = jax.tree.map(lambda leaf, i=index: leaf[i], policies)
                 try:
                     save_best(self.folder, self.names[index], policy, best)
                 except CheckpointError as error:
                     failed = True
                     self.reporter.say(f"{error}; training goes on")
-            if any_process(failed):
-                self.best[index] = before[index]
+            if not any_process(failed):
+                self.best[index] = best
 
     def _save(self, writer: CheckpointWriter, state: TrainState) -> None:
         progress = Progress(

@@ -128,7 +128,7 @@ def resume(
             f"{latest} already; give more with --total-env-steps"
         )
     if latest is not None and not config.run.checkpoint_replay:
-        again = config.prefill_vector_steps * config.task.num_envs
+        again = config.env_steps_of_prefill
         if latest + again >= config.run.total_env_steps:
             raise ConfigError(
                 f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
@@ -261,9 +261,7 @@ def _start(
                 )
         return state
 
-    prefilled = 0
-    if population.num_drawable is not None:
-        prefilled = config.prefill_vector_steps * config.task.num_envs
+    prefilled = 0 if population.num_drawable is None else config.env_steps_of_prefill
     with reporter:
         return _train_on(population, folder, reporter, callbacks, prefilled, None, started)
 

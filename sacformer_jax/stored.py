@@ -210,10 +210,6 @@ def _may_complain(thing: Any) -> bool:
     return type(thing) is tensorstore.Future
 
 
-_NOT_DAMAGE = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE}
-"""Errors that say nothing about what is in a file: the same read may succeed another time."""
-
-
 # --- metadata ------------------------------------------------------------------------------------
 
 
@@ -258,7 +254,7 @@ def read_metadata(step_path: Path) -> dict[str, Any]:
         metadata = json.loads((step_path / "metadata" / "metadata").read_text())
         digest = metadata.pop("digest")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        if isinstance(error, OSError) and error.errno in _NOT_DAMAGE:
+        if _says_nothing(error):
             reason = one_line(error)
             raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
         raise DamagedError("its metadata cannot be read") from error
@@ -330,11 +326,8 @@ def read_item(
             restored = handler.restore(step_path / item, args=args)
             return _with_empty(restored, abstract, shardings)
     except Exception as error:  # Orbax raises many kinds for damaged files
-        reason, cause = one_line(error), _root(error)
-        others = (MemoryError, PermissionError, jax.errors.JaxRuntimeError)
-        statuses = "PERMISSION_DENIED|RESOURCE_EXHAUSTED"
-        passing = _system_error(cause) in _NOT_DAMAGE
-        if passing or isinstance(cause, others) or re.search(statuses, str(cause)):
+        reason = one_line(error)
+        if _says_nothing(error):
             raise CheckpointError(f"checkpoint {step_path} cannot be read ({reason})") from error
         raise DamagedError(f"its {item} cannot be read: {reason}") from error
 
@@ -379,6 +372,21 @@ def one_line(error: BaseException) -> str:
         return os.strerror(number)
     lines = re.split(r"[.\s]*See full TensorStore details", str(error))[0].strip().splitlines()
     return lines[0][:200] if lines else type(error).__name__
+
+
+_NOT_DAMAGE = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ESTALE}
+
+
+def _says_nothing(error: BaseException) -> bool:
+    """Whether an error says nothing about what is in a file: another time it may be read."""
+    cause = _root(error)
+    kinds = (MemoryError, PermissionError, jax.errors.JaxRuntimeError)
+    statuses = "PERMISSION_DENIED|RESOURCE_EXHAUSTED"
+    return (
+        isinstance(cause, kinds)
+        or _system_error(cause) in _NOT_DAMAGE
+        or re.search(statuses, str(cause)) is not None
+    )
 
 
 def _system_error(error: BaseException) -> int | None:

@@ -18,7 +18,7 @@ from sacformer_jax.signals import stop_on_signal
 class Closed(io.StringIO):
     """A pipe that nobody reads, or a disk that is full."""
 
-    error: OSError | None = BrokenPipeError(errno.EPIPE, "Broken pipe")
+    error: OSError | None = None
 
     def write(self, text: str) -> int:
         if self.error is not None:
@@ -26,23 +26,21 @@ class Closed(io.StringIO):
         return super().write(text)
 
 
-def test_a_pipe_that_is_closed_ends_printing_alone() -> None:
+@pytest.mark.parametrize(
+    ("error", "printed"),
+    [
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), ""),  # for good
+        (OSError(errno.ENOSPC, "No space left on device"), "two\n"),
+    ],
+)
+def test_what_cannot_be_printed_ends_nothing(error: OSError, printed: str) -> None:
     reporter, output = Reporter(), Closed()
+    output.error = error
     reporter.console.file = output
     reporter.say("one")
     output.error = None
     reporter.say("two")
-    assert output.getvalue() == ""
-
-
-def test_a_log_that_is_full_loses_lines_until_there_is_room() -> None:
-    reporter, output = Reporter(), Closed()
-    output.error = OSError(errno.ENOSPC, "No space left on device")
-    reporter.console.file = output
-    reporter.say("one")
-    output.error = None
-    reporter.say("two")
-    assert output.getvalue() == "two\n"
+    assert output.getvalue() == printed
 
 
 def test_a_reader_that_leaves_does_not_end_the_program() -> None:

@@ -199,18 +199,16 @@ def _unfinished_additions(rows: Iterable[Row]) -> dict[str, int]:
 
     A line goes as far as all its seeds: seeds that are being added would cut it short.
     """
-    last: dict[tuple[str, str], dict[tuple[str, str], int]] = {}
+    lines: dict[tuple[str, str], dict[str, dict[str, int]]] = {}
     for row in rows:
-        seeds = last.setdefault((row["env"], variant_of(row)), {})
-        seed = row["run"], row["seed"]
-        seeds[seed] = max(seeds.get(seed, 0), row["env_steps"])
+        runs = lines.setdefault((row["env"], variant_of(row)), {})
+        last = runs.setdefault(row["run"], {})
+        last[row["seed"]] = max(last.get(row["seed"], 0), row["env_steps"])
     added: dict[str, int] = {}
-    for seeds in last.values():
-        runs: dict[str, int] = {}
-        for (run, _), steps in seeds.items():
-            runs[run] = min(runs.get(run, steps), steps)
-        furthest = max(runs.values())
-        added |= {run: steps for run, steps in runs.items() if steps < FINISHED_SHARE * furthest}
+    for runs in lines.values():
+        done = {run: min(last.values()) for run, last in runs.items()}
+        furthest = max(done.values())
+        added |= {run: steps for run, steps in done.items() if steps < FINISHED_SHARE * furthest}
     return added
 
 
