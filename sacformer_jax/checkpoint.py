@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -85,7 +86,7 @@ class CheckpointWriter:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            self.wait()
+            self._wait(agree=error is None)  # what this process fails at, others may not know of
         except CheckpointError as failure:
             if error is None:
                 raise
@@ -94,9 +95,7 @@ class CheckpointWriter:
             self._close()
             self._silence.close()
 
-    def save(
-        self, state: TrainState, policy: PolicyState, progress: Progress
-    ) -> CheckpointError | None:
+    def save(self, state: TrainState, policy: PolicyState, progress: Progress) -> None:
         """Saves a checkpoint under ``progress.env_steps``, where there is none yet.
 
         Returns when it has a copy of the arrays, so that they may be donated at once.
@@ -106,21 +105,15 @@ class CheckpointWriter:
           policy: of all members, leaves ``[S, ...]``.
           progress: of the host loop.
 
-        Returns:
-          what became of the save before this one, if it failed since.
-
         Raises:
-          CheckpointError: this one fails already. Older checkpoints are as they were, and the next
-            call tries again.
+          CheckpointError: this one fails already; or the one before has failed since, unless
+            :meth:`wait` has told so, and this one was not tried. Older checkpoints are as they
+            were, and the next call tries again.
         """
-        failed_before: CheckpointError | None = None
-        try:
-            self.wait()
-        except CheckpointError as error:
-            failed_before = error
+        self.wait()
         step = progress.env_steps
         if processes.of_the_first(step if step in self._folder.steps() else None) is not None:
-            return failed_before
+            return
         state, policy = _snapshot(state), _snapshot(policy)
         each = jax.tree.map(lambda _: 1, policy)
         metadata = stored.sealed(
@@ -137,22 +130,15 @@ class CheckpointWriter:
         )
         self._writing = step
         self._silence.enter_context(stored.Silence())  # what fails may do so at any time from now
-        try:
-            if self._manager is None:
-                self._manager = self._opened()
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardSave(stored.without_empty(state)),
+            policy=ocp.args.StandardSave(policy),
+            metadata=ocp.args.JsonSave(metadata),
+        )
+        with self._all_or_none():
             self._check_writable()
-            self._manager.save(
-                step,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(stored.without_empty(state)),
-                    policy=ocp.args.StandardSave(policy),
-                    metadata=ocp.args.JsonSave(metadata),
-                ),
-                force=True,
-            )
-        except Exception as error:  # Orbax raises many kinds
-            raise self._failed(error) from error
-        return failed_before
+        with self._all_or_none():
+            self._opened().save(step, args=arguments, force=True)
 
     def wait(self) -> None:
         """Returns when the checkpoint given last is on disk.
@@ -160,47 +146,62 @@ class CheckpointWriter:
         Raises:
           CheckpointError: it could not be written.
         """
+        self._wait()
+
+    def _wait(self, agree: bool = True) -> None:
         if self._writing is None or self._manager is None:
             return
-        try:
+        with self._all_or_none(agree):
             self._manager.wait_until_finished()
             if processes.is_first() and self._writing not in self._folder.steps():
                 raise OSError(f"{self._folder.checkpoints_path} lacks it")
-        except Exception as error:
-            raise self._failed(error) from error
         self._writing = None
         self._silence.close()
         self._prune()
 
-    def _opened(self) -> ocp.CheckpointManager:
-        path = self._folder.checkpoints_path
-        if processes.is_first():
-            path.mkdir(parents=True, exist_ok=True)
-            stored.remove_unfinished(path)  # of a process that was killed
-        processes.all_here()
-        # Folders are made before Orbax returns: made beside it, they are waited for by signals that
-        # a policy saved at the same time (save_best) takes for its own; and where a folder cannot
-        # be made, they are waited for 20 minutes.
-        beside = ocp.AsyncOptions(create_directories_asynchronously=False)
-        return ocp.CheckpointManager(
-            path,
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=KEEP, create=False, async_options=beside
-            ),
-        )
+    @contextlib.contextmanager
+    def _all_or_none(self, agree: bool = True) -> Iterator[None]:
+        """What fails inside in one process fails in all: each goes on as the others do.
+
+        Args:
+          agree: ask the others, which have to be here, too.
+
+        Raises:
+          CheckpointError: it has failed; what there was of the checkpoint is gone.
+        """
+        problem: Exception | None = None
+        try:
+            yield
+        except Exception as error:  # Orbax raises many kinds
+            problem = error
+        failed = problem is not None
+        if processes.any_process(failed) if agree else failed:
+            problem = problem or OSError("another process could not write it")
+            raise self._failed(problem) from problem
 
     def _check_writable(self) -> None:
-        """Raises on all processes where the first cannot make a folder: the others would wait."""
-        problem: OSError | None = None
-        probe = self._folder.checkpoints_path / f"probe{stored.UNFINISHED}"
-        try:
-            if processes.is_first():
-                probe.mkdir(exist_ok=True)
-                probe.rmdir()
-        except OSError as error:
-            problem = error
-        if processes.any_process(problem is not None):
-            raise problem or OSError("the first process cannot write")
+        """Of the first process, before all of them would wait for what it cannot make."""
+        if not processes.is_first():
+            return
+        path = self._folder.checkpoints_path
+        if self._manager is None:
+            path.mkdir(parents=True, exist_ok=True)
+            stored.remove_unfinished(path)  # of a process that was killed
+        probe = path / f"probe{stored.UNFINISHED}"
+        probe.mkdir(exist_ok=True)
+        probe.rmdir()
+
+    def _opened(self) -> ocp.CheckpointManager:
+        if self._manager is None:
+            # Folders are made before Orbax returns: made beside it, they are waited for by signals
+            # that a policy saved at the same time (save_best) takes for its own; and where a folder
+            # cannot be made, they are waited for 20 minutes.
+            beside = ocp.AsyncOptions(create_directories_asynchronously=False)
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=KEEP, create=False, async_options=beside
+            )
+            self._manager = ocp.CheckpointManager(self._folder.checkpoints_path, options=options)
+        return self._manager
 
     def _close(self) -> None:
         """Lets go of the manager; after a failure it knows no longer what is on disk."""

@@ -157,7 +157,7 @@ class Loop:
             if self._resumed is None:
                 self._evaluate(state)  # where learning starts from
                 if self.population.pretrain_chunk is not None:
-                    self._save(writer, state)  # what took long is not to be done again
+                    self._try_to_save(writer, state)  # what took long is not to be done again
             while env_steps < total and not any_process(stop_asked() or self.callbacks.stop):
                 before, chunk_start = env_steps, time.perf_counter()
                 state, metrics = jax.block_until_ready(train_chunk(state))
@@ -166,10 +166,7 @@ class Loop:
                 if _crossed(run.eval_every, before, env_steps) or env_steps >= total:
                     self._evaluate(state)
                 if _crossed(run.checkpoint_every, before, env_steps) and env_steps < total:
-                    try:
-                        self._save(writer, state)
-                    except CheckpointError as error:
-                        reporter.say(f"{error}; training goes on")
+                    self._try_to_save(writer, state)
                 if len(self.failed) == len(self.names):
                     break
             self._save_for_good(writer, state)
@@ -270,18 +267,23 @@ class Loop:
             if not any_process(failed):
                 self.best[index] = best
 
-    def _save(self, writer: CheckpointWriter, state: TrainState) -> None:
-        progress = Progress(
-            env_steps=int(state.counters.env_steps),
-            best=tuple(self.best),
-            metrics_bytes=tuple(log.num_bytes for log in self._logs),
-        )
-        failed = writer.save(self.population.stored(state), policy_of(state), progress)
-        if failed is not None:
-            self.reporter.say(f"{failed}; training goes on")
+    def _try_to_save(self, writer: CheckpointWriter, state: TrainState) -> None:
+        """Saves; the next time is tried again where the last or this one fails."""
+        try:
+            writer.wait()
+        except CheckpointError as error:
+            self.reporter.say(f"{error}; training goes on")
+        try:
+            self._save(writer, state)
+        except CheckpointError as error:
+            self.reporter.say(f"{error}; training goes on")
 
     def _save_for_good(self, writer: CheckpointWriter, state: TrainState) -> None:
         """Saves, and waits until it is on disk; what fails is tried once more."""
+        try:
+            writer.wait()
+        except CheckpointError as error:
+            self.reporter.say(f"{error}; the last one is still to come")
         try:
             self._save(writer, state)
             writer.wait()
@@ -289,6 +291,14 @@ class Loop:
             self.reporter.say(f"{error}; trying once more")
             self._save(writer, state)
             writer.wait()
+
+    def _save(self, writer: CheckpointWriter, state: TrainState) -> None:
+        progress = Progress(
+            env_steps=int(state.counters.env_steps),
+            best=tuple(self.best),
+            metrics_bytes=tuple(log.num_bytes for log in self._logs),
+        )
+        writer.save(self.population.stored(state), policy_of(state), progress)
 
 
 def _crossed(every: int, before: int, now: int) -> bool:

@@ -464,14 +464,15 @@ def test_a_save_that_failed_does_not_take_the_next_with_it(
     with CheckpointWriter(copy, program.config) as writer:
         with monkeypatch.context() as patch:
             patch.setattr(*FAILING["in the background"])
-            assert writer.save(state, policy_of(state), progress) is None
+            writer.save(state, policy_of(state), progress)
             assert writer._manager is not None
             with contextlib.suppress(Exception):
                 writer._manager.wait_until_finished()
         # There is space again before anybody has asked what became of it.
         progress = dataclasses.replace(progress, env_steps=500)
-        failed = writer.save(state, policy_of(state), progress)
-        assert "400 could not be saved" in str(failed)
+        with pytest.raises(CheckpointError, match="400 could not be saved"):
+            writer.wait()
+        writer.save(state, policy_of(state), progress)
         writer.wait()
         assert copy.latest_step() == 500
     assert digest(copy.restore(abstract).state) == digest(state)

@@ -30,7 +30,7 @@ from sacformer_jax.train import Program
 
 _PRELUDE = """
 import faulthandler; faulthandler.dump_traceback_later(50)
-import os, resource, sys
+import os, resource, shutil, sys
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec as P
 from sacformer_jax import CheckpointError, Config
@@ -149,6 +149,16 @@ with CheckpointWriter(folder, config, axes) as writer:
         writer.save(state, {"w": state["params"]["w"]}, progress(step))
         assert digest(state, axes) == sys.argv[3 + step]
     save_best(folder, "seed-1", {"w": np.float32(index)}, BestSoFar(4, 1.0))
+    state = spread(tree(3))
+    writer.save(state, {"w": state["params"]["w"]}, progress(4))
+    writer._manager.wait_until_finished()
+    if index == 0:  # it alone looks whether all is there
+        shutil.rmtree(folder.checkpoints_path / "4")
+    try:
+        writer.wait()
+    except CheckpointError as error:
+        print(error)
+    writer.save(state, {"w": state["params"]["w"]}, progress(4))
 """
 
 
@@ -167,17 +177,19 @@ def test_two_processes(tools: dict[str, Any]) -> None:
         port = str(free.getsockname()[1])
     both = [_start(_ONE_OF_TWO, folder.path, str(i), port, *digests, devices=2) for i in range(2)]
     try:
-        for process in both:
-            _finished(process)
+        for process, reason in zip(both, ("lacks it", "another process"), strict=True):
+            (line,) = [line for line in _finished(process).splitlines() if "checkpoint" in line]
+            assert "checkpoints/4 could not be saved" in line
+            assert reason in line
     finally:
         for process in both:
             process.kill()
             process.wait()
     restored = folder.restore(tools["shapes"](), axes)
-    assert restored.progress == tools["progress"](3)
+    assert restored.progress == tools["progress"](4)
     assert restored.moved_aside == ()
     assert digest(restored.state, axes) == digests[2]
-    assert folder.steps() == [2, 3]
+    assert folder.steps() == [3, 4]
     best = json.loads(metadata_file(folder.path / "seed-1" / "best" / "4").read_text())
     assert best["items"]["policy"]["['w']"]["shape"] == []
 

@@ -388,11 +388,11 @@ def test_what_cannot_be_written_once_ends_no_run(
             raise CheckpointError("best policy 400 could not be saved")
         save_best_as_it_is(*arguments)
 
-    def save(writer: CheckpointWriter, *arguments: Any) -> CheckpointError | None:
+    def save(writer: CheckpointWriter, *arguments: Any) -> None:
         saves.append(arguments)
         if len(saves) == 2:
             raise CheckpointError("checkpoint 600 could not be saved")
-        return save_as_it_is(writer, *arguments)
+        save_as_it_is(writer, *arguments)
 
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
