@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 
@@ -21,7 +21,8 @@ def stop_on_signal(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     def ask(number: int, frame: Any) -> None:
         asked.append(number)
         restore()  # first of all: what cannot be said must not keep the second from acting
-        say("stopping after this chunk, then saving; once more to stop at once")
+        with suppress(RuntimeError):  # it came amid a print of ours, which cannot be entered twice
+            say("stopping after this chunk, then saving; once more to stop at once")
 
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
