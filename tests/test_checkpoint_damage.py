@@ -200,7 +200,7 @@ def test_when_all_are_damaged_that_is_what_it_says(copy: RunFolder, abstract: Tr
 
 
 @pytest.mark.parametrize("what", ["metadata", "arrays"])
-@pytest.mark.parametrize("number", [errno.EMFILE, errno.ESTALE, errno.EACCES])
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ESTALE, errno.ETIMEDOUT, errno.EACCES])
 def test_what_may_be_read_another_time_is_not_damaged(
     copy: RunFolder, abstract: TrainState, monkeypatch: pytest.MonkeyPatch, number: int, what: str
 ) -> None:

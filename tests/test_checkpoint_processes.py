@@ -148,7 +148,7 @@ with CheckpointWriter(folder, config, axes) as writer:
         state = spread(tree(step))
         writer.save(state, {"w": state["params"]["w"]}, progress(step))
         assert digest(state, axes) == sys.argv[3 + step]
-    save_best(folder, "seed-1", {"w": np.float32(index)}, BestSoFar(4, 1.0))
+    save_best(folder, "seed-1", {"w": np.float32(index)}, BestSoFar(5, 1.0))
     state = spread(tree(3))
     writer.save(state, {"w": state["params"]["w"]}, progress(4))
     writer._manager.wait_until_finished()
@@ -190,7 +190,7 @@ def test_two_processes(tools: dict[str, Any]) -> None:
     assert restored.moved_aside == ()
     assert digest(restored.state, axes) == digests[2]
     assert folder.steps() == [3, 4]
-    best = json.loads(metadata_file(folder.path / "seed-1" / "best" / "4").read_text())
+    best = json.loads(metadata_file(folder.path / "seed-1" / "best" / "5").read_text())
     assert best["items"]["policy"]["['w']"]["shape"] == []
 
 
