@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import jax
@@ -267,23 +267,25 @@ class Loop:
             if not any_process(failed):
                 self.best[index] = best
 
+    @contextmanager
+    def _said(self, what_follows: str) -> Iterator[None]:
+        """A checkpoint that fails inside is reported, and nothing more."""
+        try:
+            yield
+        except CheckpointError as error:
+            self.reporter.say(f"{error}; {what_follows}")
+
     def _try_to_save(self, writer: CheckpointWriter, state: TrainState) -> None:
         """Saves; the next time is tried again where the last or this one fails."""
-        try:
+        with self._said("training goes on"):
             writer.wait()
-        except CheckpointError as error:
-            self.reporter.say(f"{error}; training goes on")
-        try:
+        with self._said("training goes on"):
             self._save(writer, state)
-        except CheckpointError as error:
-            self.reporter.say(f"{error}; training goes on")
 
     def _save_for_good(self, writer: CheckpointWriter, state: TrainState) -> None:
         """Saves, and waits until it is on disk; what fails is tried once more."""
-        try:
+        with self._said("the last one is still to come"):
             writer.wait()
-        except CheckpointError as error:
-            self.reporter.say(f"{error}; the last one is still to come")
         try:
             self._save(writer, state)
             writer.wait()
