@@ -20,7 +20,6 @@ from sacformer_jax.digests import num_bytes
 from sacformer_jax.logging import Record, rank
 from sacformer_jax.population import Population
 from sacformer_jax.run_folder import RunFolder
-from sacformer_jax.types import TrainState
 
 
 def _count(params: object) -> str:
@@ -99,10 +98,11 @@ class Reporter:
         yield
         self.say(f"{what}: {time.perf_counter() - start:.1f} s")
 
-    def facts(self, population: Population, state: TrainState, run_path: Path) -> None:
+    def facts(self, population: Population, run_path: Path) -> None:
         """Says what is about to run."""
         config, spec = population.config, population.program.env.spec
         members, devices = population.members, population.devices
+        state = population.abstract()
         learner = state.learner
         self.say(f"run          {run_path}")
         self.say(

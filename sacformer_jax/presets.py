@@ -25,14 +25,14 @@ class Layer:
       values: fields by bare name.
       agent: only for this agent, if given.
       env: only for this environment, if given.
-      conditioned: only for a policy that is conditioned on returns, if true.
+      unless: a field and a value: not where the configuration comes to have that.
     """
 
     source: str
     values: dict[str, Any]
     agent: str | None = None
     env: str | None = None
-    conditioned: bool = False
+    unless: tuple[str, str] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ UNKNOWN_TARGET = Layer(
     "no target is known: the best return so far, or 0",
     {"target_return": "auto"},
     agent="sacformer",
-    conditioned=True,
+    unless=("return_conditioning", "none"),
 )
 """Of tasks whose good returns nobody has told."""
 
@@ -198,7 +198,6 @@ _BEST = (
             "time_embedding": "rotary",
             "burn_in": 5,
             "acting_context": "episode",
-            "acting_context_limit": 6,
             "state_path_width": 256,
             "transformer_loss": "prediction",
             "prediction_weight": 1.0,
@@ -206,6 +205,12 @@ _BEST = (
             "critic_features": True,
         },
         agent="sacformer",
+    ),
+    Layer(
+        "preset best: acting sees as much of the past as learning",
+        {"acting_context_limit": 6},
+        agent="sacformer",
+        unless=("acting_context", "window"),
     ),
     Layer(
         "preset best: as many steps in windows, with returns along them (experiments/README.md)",
@@ -230,9 +235,15 @@ PRESETS: dict[str, tuple[Layer, ...]] = {
             agent="sacformer",
         ),
         Layer(
-            "authors' program: acts from 4, minus reward / 1000, on up to 512 steps",
-            {"target_return": 4_000.0, "return_scale": 1_000.0, "acting_context_limit": 512},
+            "authors' program: acts from 4, minus reward / 1000",
+            {"target_return": 4_000.0, "return_scale": 1_000.0},
             agent="sacformer",
+        ),
+        Layer(
+            "authors' program: acts on up to 512 steps",
+            {"acting_context_limit": 512},
+            agent="sacformer",
+            unless=("acting_context", "window"),
         ),
         Layer("authors' program: dropout left on", {"acting_dropout": True}, agent="sacformer"),
         Layer("authors' program: Xavier-uniform", {"critic_init": "xavier"}, agent="sacformer"),
@@ -270,10 +281,9 @@ def resolve(preset: str, fields: dict[str, Any], given: str = "given") -> Resolv
     if fields.get("dataset"):
         layers.append(Layer("the dataset is there instead", {"prefill_env_steps": 0}))
     layers.append(Layer(given, fields))
-    settled = collections.ChainMap(*(layer.values for layer in reversed(layers)))
-    conditioned = settled.get("return_conditioning") != "none"
+    settled = collections.ChainMap(*(layer.values for layer in reversed(layers)), config.flat())
     for layer in layers:
-        if layer.conditioned and not conditioned:
+        if layer.unless is not None and settled.get(layer.unless[0]) == layer.unless[1]:
             continue
         config = config.replace(**layer.values)
         sources.update(dict.fromkeys(layer.values, layer.source))

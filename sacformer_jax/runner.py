@@ -149,12 +149,11 @@ def resume(
             )
             for damaged in restored.moved_aside:
                 reporter.say(f"note: {damaged}")
-            state = restored.state
+            progress, again = restored.progress, 0
             if not config.run.checkpoint_replay:
-                with reporter.timed("no replay was saved: collecting one under the policy"):
-                    state, _ = jax.block_until_ready(population.refill(state))
-            reporter.facts(population, state, folder.path)
-            reporter.say(f"resuming at  {restored.progress.env_steps:,} env steps")
+                again = config.env_steps_of_prefill
+            reporter.facts(population, folder.path)
+            reporter.say(f"resuming at  {progress.env_steps:,} env steps")
             now = _split_over(xla_threads(), dataclasses.asdict(population.devices))
             for what, before in _split_over(restored.host_threads, restored.devices).items():
                 if before != now[what]:
@@ -162,9 +161,17 @@ def resume(
                         f"note: saved with {before} {what}, continued with {now[what]}: right, but "
                         "not bit for bit the same"
                     )
-            progress, env_steps = restored.progress, int(state.counters.env_steps)
+
+            def restored_state() -> TrainState:
+                if config.run.checkpoint_replay:
+                    return restored.state
+                with reporter.timed("no replay was saved: collecting one under the policy"):
+                    state, _ = jax.block_until_ready(population.refill(restored.state))
+                return state
+
+            env_steps = progress.env_steps + again
             return _train_on(
-                population, folder, reporter, callbacks, env_steps, progress, lambda: state
+                population, folder, reporter, callbacks, env_steps, progress, restored_state
             )
 
     return _alone_in(folder, go_on)
@@ -244,7 +251,6 @@ def _start(
         # Where it lies already; but now bound to it, as what is read from a checkpoint is: both
         # then compile to the same programs, and resuming finds them in the compilation cache.
         state = jax.device_put(population.init(), population.shardings)
-        reporter.facts(population, state, folder.path)
         if episodes:
             state, dropped = with_dataset(population, state, episodes)
             reporter.say(described(config.offline.dataset, episodes, dropped))
@@ -263,6 +269,7 @@ def _start(
 
     prefilled = 0 if population.num_drawable is None else config.env_steps_of_prefill
     with reporter:
+        reporter.facts(population, folder.path)
         return _train_on(population, folder, reporter, callbacks, prefilled, None, started)
 
 

@@ -201,6 +201,18 @@ def test_preset_best_changes_only_what_was_tuned() -> None:
         assert {name: best[name] for name in best if best[name] != cpu[name]} == expected
 
 
+@pytest.mark.parametrize("preset", ["best", "memory", "authors"])
+def test_a_window_in_acting_needs_no_limit(preset: str) -> None:
+    """A preset's limit is one of the episode seen."""
+    resolved = resolve(preset, {"acting_context": "window"})
+    resolved.config.validated()
+    assert resolved.config.context.acting_context_limit is None
+    assert resolved.sources["acting_context_limit"].startswith("default")
+    own = {"acting_context": "window", "acting_context_limit": 7}
+    with pytest.raises(ConfigError, match=r"acting_context_limit=7: acting_context=window shows"):
+        resolve(preset, own).config.validated()
+
+
 def test_preset_memory_shows_both_agents_the_same_past() -> None:
     sacformer, sac = (
         Config.from_preset("memory", agent=agent, env="Hopper", hide_velocities=True)

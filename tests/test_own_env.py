@@ -278,7 +278,7 @@ def test_a_run_goes_on_in_another_process_and_its_policy_needs_no_environment(na
     records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert max(record["env_steps"] for record in records) == 140
     env_names.find.cache_clear()
-    assert load_policy(run).predict(np.zeros(2)).shape == (1,)
+    assert load_policy(run).predict(np.zeros(2))[0].shape == (1,)
 
 
 # --- brax ----------------------------------------------------------------------------------------

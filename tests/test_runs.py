@@ -33,6 +33,7 @@ from sacformer_jax import (
     runner,
     train,
 )
+from sacformer_jax.callbacks import Callback, RunStart
 from sacformer_jax.checkpoint import CheckpointWriter, Restored, RunFolder
 from sacformer_jax.cores import xla_threads
 from sacformer_jax.digests import digest
@@ -179,8 +180,22 @@ def test_checkpoints_without_the_replay_are_small_and_collect_it_anew(
     before = load_policy(path, "latest").state
     with pytest.raises(ConfigError, match=r"=600: .* done 400, .* takes 200 to fill"):
         resume(path, total_env_steps=600)
+
+    collecting = "no replay was saved: collecting one under the policy"
+    starts: list[int] = []
+
+    class Refusing(Callback):
+        def on_start(self, run: RunStart) -> None:
+            starts.append(run.env_steps)
+            raise ValueError("not today")
+
+    capsys.readouterr()
+    with pytest.raises(ValueError, match="not today"):
+        resume(path, total_env_steps=800, callbacks=[Refusing()])
+    assert starts == [600]
+    assert collecting not in capsys.readouterr().out  # nothing is computed before
     result = resume(path, total_env_steps=800)
-    assert "no replay was saved: collecting one under the policy" in capsys.readouterr().out
+    assert collecting in capsys.readouterr().out
     # 200 steps to fill the replay again, without an update; then as ever.
     counts = [(r["env_steps"], r["updates"]) for r in read_records(path / "metrics.jsonl", "train")]
     assert counts == [(300, 100), (400, 200), (700, 300), (800, 400)]
