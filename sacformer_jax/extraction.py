@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +18,9 @@ from sacformer_jax.policy import member_index
 from sacformer_jax.population import make_population
 from sacformer_jax.train import policy_of
 from sacformer_jax.values import first_line
+
+_PART = ".new"
+"""Where it is put together, in the new folder."""
 
 
 def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> Path:
@@ -63,10 +66,11 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
     config = _config_of(run.config, chosen).replace(run_dir=str(target.path))
     if len(chosen) == 1:
         chosen = (Member(chosen[0].name, chosen[0].seed),)  # its settings are the run's own now
+    made = not target.path.exists()
     # A folder without a checkpoint would be a run that is to start from the beginning.
-    part = RunFolder(target.path.with_name(f".{target.path.name}.new"))
-    shutil.rmtree(part.path, ignore_errors=True)
+    part = RunFolder(target.path / _PART)
     try:
+        _remove(part.path)
         part.create(config, run.sources, folder.read_spec(), chosen)
         for member, place, num_bytes in zip(chosen, places, progress.metrics_bytes, strict=True):
             source = folder.member_path(run.members[place].name)
@@ -79,19 +83,47 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
                 shutil.copytree(source / "best", goal / "best")
         with CheckpointWriter(part, config, block_axes) as writer:
             writer.save(state, policy_of(state), progress)
-        os.rename(part.path, target.path)
-    except OSError as error:
+        _move_up(part.path)
+    except (OSError, CheckpointError) as error:
+        why = first_line(error.__cause__ or error)
         raise CheckpointError(
-            f"to={str(target.path)!r} cannot be written ({first_line(error)}): choose a folder "
+            f"to={str(target.path)!r} cannot be written ({why}): choose a folder "
             "that can, or try again where the run is being trained"
         ) from error
     finally:
-        shutil.rmtree(part.path, ignore_errors=True)
+        _remove(part.path)
+        if made:
+            with contextlib.suppress(OSError):  # it was never there, or holds the run
+                target.path.rmdir()
     return target.path
 
 
+def _move_up(part: Path) -> None:
+    """Moves all that is in a folder to the one around it, or nothing.
+
+    The folder itself may be a link or a mount, which cannot be replaced. What makes it a run comes
+    last.
+    """
+    moved: list[Path] = []
+    try:
+        for path in sorted(part.iterdir(), key=lambda path: path.name == "config.json"):
+            moved.append(path.rename(part.parent / path.name))
+        part.rmdir()
+    except BaseException:
+        for path in moved:
+            _remove(path)
+        raise
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    with contextlib.suppress(OSError):  # it is there no more, or cannot be removed
+        path.unlink()
+
+
 def _check_new(path: Path) -> None:
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+    """Refuses all but an empty folder, or one in which nothing was finished."""
+    if path.exists() and not (path.is_dir() and {each.name for each in path.iterdir()} <= {_PART}):
         raise CheckpointError(
             f"to={str(path)!r} holds a run already, or something else: choose a new folder"
         )

@@ -67,7 +67,7 @@ def train(
 
     Raises:
       ConfigError: a setting cannot work; nothing was written, but for ``config.json`` where prefill
-        turns out too short (the folder may be used again).
+        turns out too short or a callback refuses (the folder may be used again).
       CheckpointError: the folder holds a run already or cannot be written.
       DivergedError: too many updates were not finite.
       Exception: what a callback raised; the run was saved.

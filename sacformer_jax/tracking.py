@@ -184,7 +184,12 @@ def _remembered(file: Path) -> dict[str, Any]:
     try:
         known = json.loads(file.read_text())
         return {name: known[name] for name in ("project", "entity", "mode", "ids")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise ConfigError(
+            f"{file} cannot be read ({first_line(error)}): make it readable, or remove it to go on "
+            "without Weights & Biases"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{file} is damaged ({first_line(error)}): remove it to go on without Weights & Biases"
         ) from error

@@ -139,6 +139,41 @@ def test_a_run_that_cannot_be_written_as_a_whole_is_not_there(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_cannot_be_moved_to_its_place_leaves_it_empty(
+    seeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rename = Path.rename
+
+    def failing(path: Path, target: Path) -> Path:
+        if path.name == "config.json" and path.parent.name == ".new":
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(CheckpointError, match=rf"to='{tmp_path}' cannot be .*Input/output error"):
+        extract(seeds, [0], tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_into_a_link_in_which_nothing_was_finished(seeds: Path, tmp_path: Path) -> None:
+    """Where a mount or link is, no other folder can be put; what a kill left is no run."""
+    (tmp_path / "disk" / ".new" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("disk")
+    path = extract(seeds, [0, 2], tmp_path / "link")
+    assert not (path / ".new").exists()
+    assert (tmp_path / "link").is_symlink()
+    run = RunFolder(tmp_path / "disk")
+    assert run.read_config().config.all_seeds == (0, 2)
+    assert run.latest_step() == 400
+    assert (tmp_path / "disk" / "seed-2" / "best").is_dir()
+
+
+def test_a_folder_that_cannot_be_made_is_named(seeds: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CheckpointError, match=rf"to='{tmp_path}/file/to' cannot be written"):
+        extract(seeds, [0], tmp_path / "file" / "to")
+
+
 def test_from_the_command_line(
     seeds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

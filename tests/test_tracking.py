@@ -82,6 +82,12 @@ def test_what_is_remembered_of_it_and_damaged_is_named(tmp_path: Path, left: str
         resumed_tracking(tmp_path)
 
 
+def test_what_is_remembered_of_it_and_cannot_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+    (tmp_path / "wandb.json").mkdir()  # who may read everything is refused this, too
+    with pytest.raises(ConfigError, match=r"wandb\.json cannot be read .*remove it to go on"):
+        resumed_tracking(tmp_path)
+
+
 def test_their_failures_do_not_stop_training(tmp_path: Path) -> None:
     class Breaking(Callback):
         """Breaks the tracker's connection after the first evaluation."""
