@@ -12,20 +12,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import fcntl
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import figures
 from machine import UNKNOWN, cpu_with_cores
 from report.scores import variant_of
 from study_rows import NOT_COMPARED, rows_of, settings_digest
-from study_table import Row, read_table, summary, write_table
+from study_table import Row, furthest, read_table, summary, write_table
 
 import sacformer_jax
 from sacformer_jax import Config, ConfigError, resume, train
@@ -257,10 +258,35 @@ class Study:
         return rows_of(self.name, name, self._folder(name), commits, cpus)
 
     def write(self, names: Iterable[str]) -> None:
-        """Puts the rows of these runs into the table and draws it; other runs' rows stay."""
-        new = {name: rows for name in names if (rows := self.rows(name))}
-        if write_table(self.table, new, list(self.configs)):
-            figures.draw(self.table)
+        """Puts the rows of these runs into the table and draws it; other runs' rows stay, and
+        those of a run that goes further there, as where it was trained on another machine.
+        """
+        with self._table_alone():
+            there = furthest(read_table(self.table))
+            new = {}
+            for name in names:
+                rows = self.rows(name)
+                here = furthest(rows).get(name, 0)
+                if here < there.get(name, 0):
+                    print(
+                        f"{name}: {self.table.name} has {there[name]:,} env steps of it, "
+                        f"{self._folder(name).path} {here:,}; those in the table stay"
+                    )
+                elif rows:
+                    new[name] = rows
+            if write_table(self.table, new, list(self.configs)):
+                figures.draw(self.table)
+
+    @contextlib.contextmanager
+    def _table_alone(self) -> Iterator[None]:
+        """While no other process of this study writes its table and pictures."""
+        self.table.parent.mkdir(parents=True, exist_ok=True)
+        folder = os.open(self.table.parent, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(folder)
 
 
 def main_of_scales(study_at: Callable[[str], Study], arguments: Sequence[str] | None = None) -> int:

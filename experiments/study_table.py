@@ -41,6 +41,14 @@ def read_table(path: Path) -> list[Row]:
         ]
 
 
+def furthest(rows: Iterable[Row]) -> dict[str, int]:
+    """Env steps of the last row of each run, by its name."""
+    last: dict[str, int] = {}
+    for row in rows:
+        last[row["run"]] = max(last.get(row["run"], 0), row["env_steps"])
+    return last
+
+
 def write_table(path: Path, new: Mapping[str, Sequence[Row]], order: Sequence[str]) -> list[Row]:
     """Puts the rows of some runs in place of those they had; other runs' rows stay.
 

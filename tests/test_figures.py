@@ -21,7 +21,7 @@ from report.intervals import intervals_figure
 from report.lines import Program, StudyLines, read_study
 from report.scores import RANDOM_RETURNS, REFERENCE_RETURNS, normalized
 from report.styles import AGENTS, Style, styles_of
-from report.tables import aggregates, markdown
+from report.tables import aggregates, markdown, scores_csv
 from report.timed import scores_until, step_seconds, timed
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -145,6 +145,17 @@ def test_many_seeds_have_a_bootstrap_band(tmp_path: Path) -> None:
     assert "Bands: 95 % bootstrap interval of the mean." in caption_of(figure)
 
 
+def test_bands_of_few_and_of_many_seeds_are_told_apart(tmp_path: Path) -> None:
+    runs = {"Hopper-sac": [[1]] * 5, "Hopper-paper": [[1]] * 3}
+    figure = panels_figure(read(tmp_path / "mixed.csv", runs, agent="sac"))
+    assert (
+        "Bands: 95 % bootstrap interval of the mean, of fewer than 5 seeds lowest to highest."
+        in caption_of(figure)
+    )
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["SAC", "preset paper, reduced"]
+
+
 def test_runs_in_progress(tmp_path: Path) -> None:
     runs = {
         **TWO_AGENTS,
@@ -172,7 +183,11 @@ def test_runs_in_progress(tmp_path: Path) -> None:
     assert made["ppo"].improvement is not None
     assert made["ppo"].improvement.value == 1.0
     text = markdown(study, list(made.values()), "sac")
-    assert "| PPO | – | 0.00 | 1.00 on Hopper only |" in text
+    assert "| PPO | – | 0.00 on Hopper only | 1.00 on Hopper only |" in text
+    lines = scores_csv(study, list(made.values())).splitlines()
+    assert "progress,Hopper,ppo,difference,,0.0026,," in lines
+    assert "progress,Hopper,ppo,improvement,,1.0000,," in lines
+    assert [line.split(",")[1] for line in lines if ",sac,iqm," in line] == [""]
     assert "| TD3 | – † | 2 ± 1 (2 / 4) † |" in text
     assert "| PPO | 8 (8) † | 8 (8) |" in text
     assert "\n† Not finished: TD3 on HalfCheetah (not begun); TD3 on Hopper" in text
@@ -502,7 +517,7 @@ def lightness(style: Style) -> float:
 
 @pytest.mark.parametrize("variants", [
     list(AGENTS), ["K=1", "K=2", "K=5", "K=10", "K=15", "K=20"], ["sacformer", *"abcde"],
-    ["sac", "a"], ["a"],
+    ["sac", "a"], ["a"], ["sacformer", "sac", "a"], ["sacformer", "sac", *"abcd"],
 ])  # fmt: skip
 def test_lines_can_be_told_apart_without_colour(variants: list[str]) -> None:
     styles = styles_of(variants)

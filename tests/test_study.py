@@ -96,6 +96,24 @@ def test_the_table_holds_every_evaluation(tmp_path: Path) -> None:
     assert (tmp_path / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_run_that_goes_further_in_the_table_stays_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where its folder was left on another machine, and it is begun again here."""
+    study = _study(tmp_path)
+    _pretend(study, "Hopper-b", [1.0, 2.0], [8.0, 9.0])
+    study.write(["Hopper-b"])
+    finished = study.table.read_bytes()
+    shutil.rmtree(study.runs)
+    _pretend(study, "Hopper-b", [5.0], [5.0])
+    study.write(["Hopper-b"])
+    assert study.table.read_bytes() == finished
+    assert "tiny.csv has 200 env steps of it" in capsys.readouterr().out
+    _pretend(study, "Hopper-b", [5.0, 6.0], [5.0, 6.0])  # as far: the newer ones
+    study.write(["Hopper-b"])
+    assert study.table.read_bytes() != finished
+
+
 def test_where_a_run_was_trained_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study, latest = _study(tmp_path), None
     study.runs.mkdir()
@@ -310,16 +328,17 @@ def test_the_arena_is_fair_and_its_seeds_are_fresh(
         for config in importlib.import_module(arguments[0]).study(*arguments[1:]).configs.values()
         for seed in config.all_seeds
     }
+    for config in configs.values():
+        config.validated()
+        assert not tuned & set(config.all_seeds)
     tasks = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")[: 5 if arena == "full" else 3]
     for task in tasks:
         own, opponent = configs[f"{task}-sacformer"], configs[f"{task}-sac"]
         for config in (own, opponent):
-            config.validated()
             assert config.preset == preset
             assert (config.task.hide_velocities, config.task.action_delay) == kept
         assert own.all_seeds == opponent.all_seeds
         assert len(own.all_seeds) >= 5
-        assert not tuned & set(own.all_seeds)
 
 
 def test_seeds_added_to_the_arena_are_as_the_first_five_but_others() -> None:

@@ -209,13 +209,12 @@ def _caption(study: StudyLines, averages: dict[str, _Curve], in_panels: bool = F
     """``in_panels``: every line has a panel, which is empty where it has not begun."""
     text = f"Study {study.name}: {facts(study)}. Lines: mean over seeds, not smoothed."
     seeds = {len(line.seeds) for line in study.lines.values()}
-    if any(1 < number < SEEDS_FOR_INTERVAL for number in seeds):
-        text += " Bands: lowest to highest seed."
+    few = any(1 < number < SEEDS_FOR_INTERVAL for number in seeds)
     if any(number >= SEEDS_FOR_INTERVAL for number in seeds):
         text += " Bands: 95 % bootstrap interval of the mean"
-        text += (
-            f" (of {SEEDS_FOR_INTERVAL} seeds or more)." if min(seeds) < SEEDS_FOR_INTERVAL else "."
-        )
+        text += f", of fewer than {SEEDS_FOR_INTERVAL} seeds lowest to highest." if few else "."
+    elif few:
+        text += " Bands: lowest to highest seed."
     if averages:
         text += (
             f" {_AVERAGE}: interquartile mean of normalized scores of all runs "

@@ -23,13 +23,16 @@ FINISHED_SHARE = 0.95
 """A line that ends before this share of the study's longest is in progress. Evaluations of
 different agents do not end at the very same step."""
 LABELS = {"sacformer": "SACFormer", "sac": "SAC", "td3": "TD3", "ddpg": "DDPG", "ppo": "PPO"}
+_NAMES = LABELS | {
+    name: f"preset {name}, reduced" for name in ("paper", "authors")
+}  # by the sizes of variants.py
 _BASELINES = ("sac", "sac-lambda", "sacformer", "cpu", "K=10")
 _NEEDED = {"run", "agent", "env", "engine", "seed", "env_steps", "return_mean", "episodes"}
 
 
 def label_of(variant: str) -> str:
     """How a variant is written in figures and tables."""
-    return LABELS.get(variant, variant)
+    return _NAMES.get(variant, variant)
 
 
 @dataclasses.dataclass(frozen=True)

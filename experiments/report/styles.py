@@ -50,6 +50,8 @@ MOST_LINES = len(_OTHERS)
 """Lines that can be told apart in one panel."""
 _PALEST = 0.82
 """Where the colour map ends: what is paler does not print."""
+_DARKEST_BESIDE_AGENTS = 0.46
+"""Where it begins beside SACFormer and SAC, which are darker."""
 
 
 def styles_of(variants: Sequence[str]) -> dict[str, Style]:
@@ -60,11 +62,13 @@ def styles_of(variants: Sequence[str]) -> dict[str, Style]:
         raise ValueError(f"{len(variants)} lines in one panel; at most {MOST_LINES}")
     styles = {variant: AGENTS[variant] for variant in variants if variant in AGENTS}
     others = [variant for variant in variants if variant not in AGENTS]
-    # Beside an agent the first, solid and darkest, is left out.
-    offset = 1 if styles else 0
+    # Beside an agent the first, solid and darkest, is left out; beside more the darker ones, and
+    # dashes like SAC's.
+    offset, number = len(styles), max(1, len(others))
+    darkest = (0.0, _PALEST / number, _DARKEST_BESIDE_AGENTS)[min(offset, 2)]
     colors = matplotlib.colormaps["viridis"]
-    for place, variant in enumerate(others, offset):
-        dashes, marker = _OTHERS[place]
-        shade = _PALEST * place / max(1, offset + len(others) - 1)
+    for place, variant in enumerate(others):
+        dashes, marker = _OTHERS[offset + place]
+        shade = darkest + (_PALEST - darkest) * place / max(1, number - 1)
         styles[variant] = Style(to_hex(colors(shade)), dashes, marker)
     return styles

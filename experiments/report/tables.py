@@ -1,11 +1,11 @@
 """The tables of a study: results/STUDY.md to read and results/STUDY-scores.csv to go on from.
 
 The CSV has a line for each number: ``study, task, variant, statistic, seed, value, low, high``.
-``task`` is empty for statistics over tasks, ``seed`` but for single runs, ``low`` and ``high``
-where there is no 95 % interval. Statistics: ``score`` of a run, ``mean`` and ``std`` over the
-seeds, ``env_steps`` at the end, ``iqm`` of normalized scores, ``difference`` (of it, less the
-baseline's), ``improvement`` (probability of, over the baseline), ``ratio_to_cleanrl`` (study
-baselines).
+``task`` is empty for statistics over all tasks, and names those they are of (``Hopper+Ant``) where
+that is not all, ``seed`` is empty but for single runs, ``low`` and ``high`` where there is no 95 %
+interval. Statistics: ``score`` of a run, ``mean`` and ``std`` over the seeds, ``env_steps`` at the
+end, ``iqm`` of normalized scores, ``difference`` (of it, less the baseline's), ``improvement``
+(probability of, over the baseline), ``ratio_to_cleanrl`` (study baselines).
 """
 
 from __future__ import annotations
@@ -125,7 +125,8 @@ def _csv_rows(study: StudyLines, made: Sequence[Aggregate]) -> Iterator[tuple[An
         ):
             if estimate is not None:
                 numbers = (estimate.value, estimate.low, estimate.high)
-                yield "", one.variant, name, "", *(_digits(number, 4) for number in numbers)
+                of = "" if name == "iqm" or one.tasks == study.tasks else "+".join(one.tasks)
+                yield of, one.variant, name, "", *(_digits(number, 4) for number in numbers)
 
 
 def _digits(value: float, digits: int) -> str:
@@ -274,11 +275,13 @@ def _timed_table(study: StudyLines, baseline: str) -> str:
 
 
 def _compared(study: StudyLines, one: Aggregate | Timed) -> tuple[str, str]:
-    """Difference from the baseline, and probability of improvement with the tasks it is of."""
-    better = _bracketed(one.improvement)
-    if one.improvement is not None and one.tasks != study.tasks:
-        better += f" on {', '.join(one.tasks)} only"
-    return _bracketed(one.difference), better
+    """Difference from the baseline, and probability of improvement, with the tasks these are of."""
+    of = "" if one.tasks == study.tasks else f" on {', '.join(one.tasks)} only"
+
+    def cell(estimate: Estimate | None) -> str:
+        return _bracketed(estimate) + (of if estimate is not None else "")
+
+    return cell(one.difference), cell(one.improvement)
 
 
 def _bracketed(estimate: Estimate | None) -> str:
