@@ -1,6 +1,6 @@
-"""Every option of the method by itself: preset `cpu` with smaller networks and one thing changed.
+"""The options of the paper and the authors' program, each by itself: one thing changed in `cpu`.
 
-Beside them the presets `paper` and `authors` at the same sizes. A check that all of them run and
+Of preset `cpu` with smaller networks; beside it the presets `paper` and `authors` at these sizes. A check that all of them run and
 learn, on two tasks with two seeds; no verdict on any.
 
 python experiments/variants.py --jobs 2

@@ -60,7 +60,7 @@ class TaskConfig:
     hide_velocities: bool = False
     """Leave the velocities out of the observation."""
     action_delay: int = 0
-    """Steps between choosing an action and its effect; until then it is 0."""
+    """Steps between choosing an action and its effect; the first actions of an episode are 0."""
     stack_obs: int = 1
     """Observations seen as one, with the actions between them."""
 
@@ -98,7 +98,7 @@ class ReplayConfig:
     buffer_capacity: int = 1_000_000
     """Environment steps the replay holds, over all environments."""
     batch_size: int = 128
-    """Windows in a batch; each has up to context_length steps."""
+    """Windows in a batch; each has up to learnt_steps steps to learn from."""
     updates_per_env_step: float = 1.0
     """Gradient updates per environment step (UTD), over all environments."""
 
@@ -129,7 +129,7 @@ class ContextConfig:
     acting_context_limit: int | None = None
     """Newest pairs seen at most with acting_context=episode; None: all."""
     window: WindowKind = "contiguous"
-    """K steps of a window: contiguous, or drawn from one finished episode and sorted."""
+    """Steps of a window: contiguous, or drawn from one finished episode and sorted."""
     return_conditioning: Conditioning = "hindsight"
     """Return-to-go in training: obtained afterwards, commanded (Eq. 1 as in acting), or none."""
     target_return: float | Literal["auto"] = 5_000.0
@@ -169,9 +169,9 @@ class ActorConfig:
     """The actor network."""
 
     actor_layers: int = 3
-    """Transformer blocks (sacformer) or hidden layers (sac)."""
+    """Transformer blocks (sacformer) or hidden layers (the other agents)."""
     actor_width: int = 128
-    """Width of tokens (sacformer) or hidden layers (sac)."""
+    """Width of tokens (sacformer) or hidden layers (the other agents)."""
     actor_heads: int = 1
     """Attention heads (sacformer)."""
     actor_mlp_ratio: int = 4
@@ -187,7 +187,8 @@ class ActorConfig:
     so that only its difference counts, or not at all (sacformer)."""
     state_path_width: int = 0
     """Width of an MLP of two layers from the newest state to the heads, around the transformer,
-    whose part starts at zero; 0: none (sacformer)."""
+    whose part starts at zero; with transformer_loss=prediction it sees the transformer's features
+    beside the state; 0: none (sacformer)."""
     transformer_loss: TransformerLoss = "policy"
     """What the transformer learns from: the actor's loss, that of its prediction in it; or the
     prediction alone, its features then given to the MLP of state_path_width (sacformer)."""
@@ -250,8 +251,8 @@ class LearningConfig:
     discount: float = 0.99
     """Discount factor γ."""
     prediction_weight: float = 0.0
-    """Weight of the loss in predicting the next observation and the reward, as a share of their
-    variance, in the actor's (sacformer); 0: it does not."""
+    """Weight of foretelling the next observation and the reward, whose errors count as a share of
+    their variance; 0: nothing is foretold (sacformer)."""
     prediction_steps: int | Literal["effect"] = 1
     """Steps that are foretold; effect: up to the one in which the action comes into effect
     (1 + action_delay), as far as a window shows them."""
