@@ -53,7 +53,7 @@ bench: install  ## how fast it is: a table, with JSON=FILE that file, too, with 
 	$(BIN)/python experiments/benchmark.py $(if $(JSON),--json $(JSON)) $(FLAGS)
 
 test: install  ## the quick tests (under 12 minutes on 2 cores)
-	$(BIN)/python -m pytest -n 2 --dist loadscope -m "not slow" $(FLAGS)
+	$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m "not slow" $(FLAGS)
 
 test-all: install  ## every test, the slow ones too
 	$(BIN)/python -m pytest $(FLAGS)

@@ -1,7 +1,7 @@
 """The options of the paper and the authors' program, each by itself: one thing changed in `cpu`.
 
-Of preset `cpu` with smaller networks; beside it the presets `paper` and `authors` at these sizes. A check that all of them run and
-learn, on two tasks with two seeds; no verdict on any.
+Of preset `cpu` with smaller networks; beside it the presets `paper` and `authors` at these sizes.
+A check that all of them run and learn, on two tasks with two seeds; no verdict on any.
 
 python experiments/variants.py --jobs 2
 """

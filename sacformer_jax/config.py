@@ -7,7 +7,10 @@ Every field name is unique over all sections, so a field can be given by its bar
 from __future__ import annotations
 
 import dataclasses
+import functools
+import types
 import typing
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any, Literal
 
@@ -449,7 +452,8 @@ class Config:
         return self
 
 
-def field_places() -> dict[str, tuple[str, Any]]:
+@functools.cache
+def field_places() -> Mapping[str, tuple[str, Any]]:
     """Each field's section ("" at the top) and type, by bare name."""
     places: dict[str, tuple[str, Any]] = {}
     for name, kind in typing.get_type_hints(Config).items():
@@ -459,7 +463,7 @@ def field_places() -> dict[str, tuple[str, Any]]:
                 places[inner] = (name, inner_kind)
         else:
             places[name] = ("", kind)
-    return places
+    return types.MappingProxyType(places)
 
 
 def shortest_column(max_episode_steps: int, window_length: int, scattered: bool) -> int:

@@ -109,7 +109,8 @@ def update_of_the_same_batch(agent_name: str) -> float:
     state, _ = population.prefill(population.init())
     state = jax.tree.map(lambda s, x: x[0] if len(s) else x, population.specs, state)
     hyper = hyperparameters(config, program.env.spec.action_size)
-    window = program.buffer.sample(state.buffer, key, 32, hyper.rtg_discount)
+    sample = jax.jit(program.buffer.sample, static_argnums=2)
+    window = sample(state.buffer, key, 32, hyper.rtg_discount)
     expected, metrics = jax.jit(program.agent.update)(state.learner, hyper, window, key)
 
     split_agent = agents.make(config, program.env.spec, DataAxis(4))
@@ -125,8 +126,8 @@ def update_of_the_same_batch(agent_name: str) -> float:
             check_vma=False,
         )
     )
-    ours, our_metrics = update(state.learner, hyper, window, key)
     compiled = update.lower(state.learner, hyper, window, key).compile()
+    ours, our_metrics = compiled(state.learner, hyper, window, key)
     assert collectives(compiled) == {"all-reduce": 3}, collectives(compiled)
     for name, value in metrics.items():
         np.testing.assert_allclose(our_metrics[name], value, rtol=1e-4, atol=1e-6, err_msg=name)

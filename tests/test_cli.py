@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
 import re
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -325,7 +326,7 @@ def test_a_run_is_not_trained_over(
     _assert_refused(said, f"sacformer resume {run_without_checkpoint}")
 
 
-# --- whole runs, each command a process of its own ---------------------------------------------
+# --- whole runs ----------------------------------------------------------------------------------
 
 
 class Command:
@@ -372,7 +373,8 @@ class Command:
 
 @dataclasses.dataclass(frozen=True)
 class Runs:
-    """Two equal runs, one that ended at ``STOP`` and one stopped by Ctrl-C, then both resumed.
+    """Two equal runs, one that ended at ``STOP`` and one, a process of its own, stopped by Ctrl-C;
+    then both resumed.
 
     Attributes:
       folder: where they are, as ``ended`` and ``stopped``.
@@ -389,37 +391,36 @@ class Runs:
     total: int
 
 
+def _here(*args: object) -> Said:
+    """What a command answers in this process."""
+    with (
+        contextlib.redirect_stdout(io.StringIO()) as out,
+        contextlib.redirect_stderr(io.StringIO()) as err,
+    ):
+        code = main([str(arg) for arg in args])
+    return Said(code, out.getvalue(), err.getvalue())
+
+
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runs]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder = tmp_path_factory.mktemp("cli")
-    logs = tmp_path_factory.mktemp("logs")
-    commands: list[Command] = []
 
-    def start(*args: object) -> Command:
-        commands.append(Command(logs, *args))
-        return commands[-1]
+    def training(name: str, total: int) -> tuple[object, ...]:
+        return "train", *_flags(TINY), "--run-dir", folder / name, "--total-env-steps", total
 
+    ended = _here(*training("ended", STOP))
+    stopping = Command(tmp_path_factory.mktemp("logs"), *training("stopped", HUGE))
     try:
-        training = {
-            name: start(
-                "train", *_flags(TINY), "--run-dir", folder / name, "--total-env-steps", total
-            )
-            for name, total in {"stopped": HUGE, "ended": STOP}.items()
-        }
-        training["stopped"].read_until("eval return")
-        training["stopped"].process.send_signal(signal.SIGINT)
-        trained = {name: command.wait() for name, command in training.items()}
-        stopped_at = RunFolder(folder / "stopped").latest_step()
-        assert stopped_at is not None, trained["stopped"].err
-        total = max(stopped_at, STOP) + 100
-        resuming = {
-            name: start("resume", folder / name, "--total-env-steps", total) for name in training
-        }
-        resumed = {name: command.wait() for name, command in resuming.items()}
-        yield Runs(folder, trained, stopped_at, resumed, total)
+        stopping.read_until("eval return")
+        stopping.process.send_signal(signal.SIGINT)
+        trained = {"ended": ended, "stopped": stopping.wait()}
     finally:
-        for command in commands:
-            command.stop()
+        stopping.stop()
+    stopped_at = RunFolder(folder / "stopped").latest_step()
+    assert stopped_at is not None, trained["stopped"].err
+    total = max(stopped_at, STOP) + 100
+    resumed = {name: _here("resume", folder / name, "--total-env-steps", total) for name in trained}
+    return Runs(folder, trained, stopped_at, resumed, total)
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(runs: Runs) -> None:

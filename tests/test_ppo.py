@@ -438,9 +438,14 @@ def test_updates_are_those_of_one_adam_on_the_total_loss(
 # --- updates that are not finite ------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def update(config: Config) -> Any:
+    return jax.jit(partial(ppo_update.update, parts_of(config)))
+
+
 @pytest.mark.parametrize("what", CHECKED[:7])
 def test_a_tensor_that_is_not_finite_leaves_the_networks_as_they_were(
-    config: Config, learner: LearnerState, what: str
+    config: Config, learner: LearnerState, update: Any, what: str
 ) -> None:
     samples = random_samples().replace(mask=jnp.ones(64, bool))
     start = learner
@@ -456,7 +461,6 @@ def test_a_tensor_that_is_not_finite_leaves_the_networks_as_they_were(
         samples = samples.replace(log_prob=samples.log_prob - 200.0, advantage=-jnp.arange(64.0))
     else:
         samples = samples.replace(value_target=jnp.full(64, 1e25))
-    update = jax.jit(partial(ppo_update.update, parts_of(config)))
     new, metrics = update(start, hyperparameters(config, 1), samples, jax.random.key(0))
     assert CHECKED[int(metrics["fault"])] == what
     assert set(unequal(new, start)) == {".num_updates"}
@@ -784,8 +788,10 @@ def _described(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]
 
 
 def test_a_run_from_the_command_line_resumes_to_the_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # It would decide over the threads of every process that later tests start.
+    monkeypatch.setattr(cli, "choose_xla_threads", lambda config: None)
     path = tmp_path / "straight"
     settings = {**TINY, "seeds": 2, "run_dir": path}
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]

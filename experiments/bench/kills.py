@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
+import io
 import json
-import os
 import random
 import statistics
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any
 
 from bench.watched import PHASES, Process, last_record, members, newest_checkpoint
 from sacformer_jax import load_policy
+from sacformer_jax.cli import main
 from sacformer_jax.digests import digest
 
 SETTINGS: dict[str, int | float | str] = {
@@ -136,15 +136,15 @@ class Runs:
           RuntimeError: its state cannot be read.
         """
         run = self.folder / name
-        done = subprocess.run(
-            [sys.executable, "-m", "sacformer_jax.cli", "describe", str(run), "--json"],
-            env={**os.environ, **self._environment},
-            capture_output=True,
-            text=True,
-        )
-        if done.returncode:
-            raise RuntimeError(f"{run}: {(done.stderr.strip() or 'no output').splitlines()[-1]}")
-        found = {"train state": json.dumps(json.loads(done.stdout)["digest"])}
+        with (
+            contextlib.redirect_stdout(io.StringIO()) as printed,
+            contextlib.redirect_stderr(io.StringIO()) as said,
+        ):
+            code = main(["describe", str(run), "--json"])
+        if code:
+            lines = said.getvalue().strip().splitlines() or ["no output"]
+            raise RuntimeError(f"{run}: {lines[-1]}")
+        found = {"train state": json.dumps(json.loads(printed.getvalue())["digest"])}
         for folder in members(run):
             alone = folder == run
             at = "" if alone else f"{folder.name}/"
