@@ -2,10 +2,11 @@
 
 python experiments/figures.py                     # of every study
 python experiments/figures.py figure2-cpu         # of one
+python experiments/figures.py arena-hidden arena-delay --together arena-memory  # of two as one
 
 Beside STUDY.csv it writes STUDY.png and STUDY.svg (learning curves), STUDY-scores.png and .svg
 (intervals, where there are six variants or more), STUDY.md and STUDY-scores.csv. The same table
-gives the same bytes.
+gives the same bytes. With ``--together NAME`` it writes NAME.md alone, over all their tasks.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from report.lines import is_study_table, read_study
 from report.page import FONTS
 from report.styles import MOST_LINES
 from report.tables import aggregates, markdown, scores_csv
+from report.together import together_markdown
 
 RESULTS = Path(__file__).parent / "results"
 INTERVALS_FROM = 6
@@ -69,6 +71,30 @@ def draw(table: Path, baseline: str | None = None) -> list[Path]:
     return paths
 
 
+def draw_together(to: Path, tables: Sequence[Path], baseline: str | None = None) -> Path:
+    """Writes what variants come to over the tasks of several studies together.
+
+    Args:
+      to: the file, ``results/NAME.md``.
+      tables: ``results/STUDY.csv`` of each.
+      baseline: as for one study; default: that of the first.
+
+    Returns:
+      the file.
+
+    Raises:
+      ValueError: one has no evaluation yet, or see ``together_markdown``.
+    """
+    studies = []
+    for table in tables:
+        study = read_study(table)
+        if study is None or not study.last_step:
+            raise ValueError(f"study {table.stem}: has no evaluation yet")
+        studies.append(study)
+    to.write_text(together_markdown(to.stem, studies, baseline or studies[0].baseline()))
+    return to
+
+
 def _save(figure: Figure, stem: Path) -> list[Path]:
     """As PNG and SVG, without anything that differs from time to time."""
     FigureCanvasAgg(figure)
@@ -98,15 +124,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Figures and tables of studies.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="default: all in the folder")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
+    parser.add_argument("--together", metavar="NAME", help="the studies as one, in NAME.md")
     parser.add_argument("--baseline", help="the variant that others are compared with")
     args = parser.parse_args(arguments)
     there = {path.stem: path for path in sorted(args.results.glob("*.csv")) if is_study_table(path)}
     unknown = [name for name in args.studies if name not in there]
     if unknown:
         parser.error(f"{', '.join(unknown)}: no such table; there are {', '.join(there)}")
-    for name in args.studies or there:
+    if args.together is not None and len(args.studies) < 2:
+        parser.error("--together: name two studies or more")
+    for name in [args.together] if args.together else args.studies or there:
         try:
-            paths = draw(there[name], args.baseline)
+            if args.together:
+                tables = [there[study] for study in args.studies]
+                paths = [draw_together(args.results / f"{name}.md", tables, args.baseline)]
+            else:
+                paths = draw(there[name], args.baseline)
         except ValueError as error:
             parser.error(str(error))
         print(f"{name}: {', '.join(path.name for path in paths) or 'nothing to draw yet'}")

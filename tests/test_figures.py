@@ -564,6 +564,39 @@ def test_tasks_without_a_scale_have_no_average(tmp_path: Path) -> None:
     assert "| TD3 | – | – | 1.00 [1.00, 1.00] on tiny only |" in markdown(study, made, "sac")
 
 
+def test_studies_together_are_as_one_of_all_their_tasks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    of = {
+        "one": {"Hopper-sac": (0.1, 0.2, 0.3, 0.4), "Hopper-x": (0.5, 0.6, 0.7, 0.8)},
+        "two": {"Hopper-sac": (0.0, 0.1, 0.2, 0.3), "Hopper-x": (0.1, 0.2, 0.4, 0.9),
+                "Hopper-y": (0.0, 0.0, 0.0, 0.0)},
+    }  # fmt: skip
+    for name, runs in of.items():
+        lines = {run: [[r] for r in returns_for("Hopper", *of_run)] for run, of_run in runs.items()}
+        write(tmp_path / f"{name}.csv", lines)
+    arguments = ["one", "two", "--results", str(tmp_path)]
+    assert figures.main([*arguments, "--together", "both"]) == 0
+    assert capsys.readouterr().out == "both: both.md\n"
+    text = (tmp_path / "both.md").read_text()
+    # Of SAC's eight scores the middle four are .1 .2 .2 .3, of the other's .4 .5 .6 .7.
+    assert "| SAC | 0.20 [" in text
+    assert "| x | 0.55 [" in text
+    assert "] | 0.35 [" in text
+    # Better in 16 of 16 pairs, and in 11 and two halves of 16.
+    assert f"] | {(1 + 12 / 16) / 2:.2f} [" in text
+    assert "| y |" not in text
+    assert "one: Hopper; two: Hopper" in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["both.md", "one.csv", "two.csv"]
+    for wrong, why in (
+        (["one", "--together", "x"], "two studies or more"),
+        (["one", "two", "--together", "x", "--baseline", "y"], "baseline 'y': not finished"),
+    ):
+        with pytest.raises(SystemExit):
+            figures.main([*wrong, "--results", str(tmp_path)])
+        assert why in capsys.readouterr().err
+
+
 def test_tables_without_rows_and_strange_arguments(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -236,7 +236,7 @@ def _scores_table(study: StudyLines) -> str:
         [label_of(variant), *(cell(task, variant) for task in study.tasks)]
         for variant in study.variants
     ]
-    return _table(["", *study.tasks], rows)
+    return table(["", *study.tasks], rows)
 
 
 def _about_aggregates(study: StudyLines, baseline: str) -> str:
@@ -258,9 +258,9 @@ def _about_aggregates(study: StudyLines, baseline: str) -> str:
 def _aggregates_table(study: StudyLines, made: Sequence[Aggregate], baseline: str) -> str:
     rows = []
     for one in made:
-        rows.append([label_of(one.variant), _bracketed(one.iqm), *_compared(study, one)])
+        rows.append([label_of(one.variant), bracketed(one.iqm), *_compared(study, one)])
     name = label_of(baseline)
-    return _table(["", "interquartile mean", f"less {name}'s", f"P(better than {name})"], rows)
+    return table(["", "interquartile mean", f"less {name}'s", f"P(better than {name})"], rows)
 
 
 def _timed_table(study: StudyLines, baseline: str) -> str:
@@ -271,7 +271,7 @@ def _timed_table(study: StudyLines, baseline: str) -> str:
         return "Nothing to compare yet."
     name = label_of(baseline)
     head = ["", f"seconds, {name}'s = 1", f"interquartile mean less {name}'s"]
-    return _table([*head, f"P(better than {name})"], rows)
+    return table([*head, f"P(better than {name})"], rows)
 
 
 def _compared(study: StudyLines, one: Aggregate | Timed) -> tuple[str, str]:
@@ -279,12 +279,13 @@ def _compared(study: StudyLines, one: Aggregate | Timed) -> tuple[str, str]:
     of = "" if one.tasks == study.tasks else f" on {', '.join(one.tasks)} only"
 
     def cell(estimate: Estimate | None) -> str:
-        return _bracketed(estimate) + (of if estimate is not None else "")
+        return bracketed(estimate) + (of if estimate is not None else "")
 
     return cell(one.difference), cell(one.improvement)
 
 
-def _bracketed(estimate: Estimate | None) -> str:
+def bracketed(estimate: Estimate | None) -> str:
+    """``0.11 [0.01, 0.21]``; a dash for none."""
     if estimate is None:
         return "–"
     if math.isnan(estimate.low):
@@ -304,9 +305,10 @@ def _published_table(study: StudyLines) -> str:
             f"{line.last_step:,}",
         ])  # fmt: skip
     head = ["task", "agent", "here", "here / CleanRL", *PUBLISHED, "env steps here"]
-    return _table(head, rows)
+    return table(head, rows)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
