@@ -153,7 +153,7 @@ def test_bands_of_few_and_of_many_seeds_are_told_apart(tmp_path: Path) -> None:
         in caption_of(figure)
     )
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["SAC", "preset paper, reduced"]
+    assert labels == ["SAC", "preset paper (reduced)"]
 
 
 def test_runs_in_progress(tmp_path: Path) -> None:

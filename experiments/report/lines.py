@@ -23,9 +23,9 @@ FINISHED_SHARE = 0.95
 """A line that ends before this share of the study's longest is in progress. Evaluations of
 different agents do not end at the very same step."""
 LABELS = {"sacformer": "SACFormer", "sac": "SAC", "td3": "TD3", "ddpg": "DDPG", "ppo": "PPO"}
-_NAMES = LABELS | {
-    name: f"preset {name}, reduced" for name in ("paper", "authors")
-}  # by the sizes of variants.py
+_REDUCED = {name: f"preset {name} (reduced)" for name in ("paper", "authors")}
+"""SACFormer, smaller than these presets make it: see variants.py."""
+_NAMES = LABELS | _REDUCED | {"sacformer-path": "SACFormer (earlier)"}
 _BASELINES = ("sac", "sac-lambda", "sacformer", "cpu", "K=10")
 _NEEDED = {"run", "agent", "env", "engine", "seed", "env_steps", "return_mean", "episodes"}
 
