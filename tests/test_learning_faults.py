@@ -128,7 +128,7 @@ def test_skipped_updates_are_counted_and_are_in_no_mean() -> None:
 DIVERGING = {
     "env": "Hopper", "agent": "sac", "num_envs": 2, "max_episode_steps": 50,
     "prefill_env_steps": 200, "chunk_env_steps": 100, "total_env_steps": 2_000, "eval_every": 500,
-    "eval_episodes": 1, "actor_width": 8, "actor_layers": 1, "critic_width": 8, "batch_size": 4,
+    "eval_episodes": 2, "actor_width": 8, "actor_layers": 1, "critic_width": 8, "batch_size": 4,
     "buffer_capacity": 2_000, "updates_per_env_step": 1.0, "critic_learning_rate": 1e25,
     "max_skipped_updates": 150,
 }  # fmt: skip

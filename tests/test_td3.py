@@ -296,8 +296,8 @@ POLICY = ("actor_params", "actor_opt", "target_actor_params", "target_critic_par
 
 
 @pytest.mark.parametrize("delay", [2, 3])
-def test_actor_and_targets_move_every_so_many_updates(delay: int) -> None:
-    setup = make_setup(policy_delay=delay)
+def test_actor_and_targets_move_every_so_many_updates(td3: Setup, delay: int) -> None:
+    setup = td3 if delay == 2 else make_setup(policy_delay=delay)
     learner, losses, reported = setup.learner, [], []
     for number in range(1, 2 * delay + 2):
         window, key = make_window(number), jax.random.key(number)
@@ -410,9 +410,9 @@ def test_exploration_stays_within_the_bounds() -> None:
     assert ((action > LOW) & (action < HIGH)).any(0).all()
 
 
-def test_observations_are_normalized_everywhere() -> None:
+def test_observations_are_normalized_everywhere(prompt: Setup) -> None:
     """Shifted and scaled observations under statistics that undo it: the same update, action."""
-    plain, setup = make_setup(policy_delay=1), make_setup(policy_delay=1, normalize_obs=True)
+    plain, setup = prompt, make_setup(policy_delay=1, normalize_obs=True)
     shift, scale = jnp.array([3.0, -1.0, 0.5]), jnp.array([2.0, 0.5, 4.0])
     normalizer = dataclasses.replace(
         setup.learner.normalizer, count=jnp.int32(1_000), mean=shift, m2=1_000 * scale**2
@@ -481,30 +481,24 @@ def test_an_actor_that_is_not_finite_stays_and_the_critics_go_on(td3: Setup) -> 
 # --- members and devices ---------------------------------------------------------------------
 
 
-def test_a_batch_split_over_devices_is_the_same_update() -> None:
-    shards = 4
-
-    def of(number: int) -> Agent:
-        config = point_config(**PLAIN, agent="td3", **WILD)
-        return agents.make(config, SPEC, DataAxis(number))
-
+def test_a_batch_split_over_devices_is_the_same_update(td3: Setup) -> None:
+    shards, config = 4, point_config(**PLAIN, agent="td3", **WILD)
     window = make_window()
     split = jax.tree.map(lambda x: x.reshape(shards, -1, *x.shape[1:]), window)
-    one, setup = jax.jit(of(1).update), make_setup()
     many = jax.jit(
         jax.vmap(
-            of(shards).update,
+            agents.make(config, SPEC, DataAxis(shards)).update,
             in_axes=(None, None, 0, None),
             # Whatever differs between shards shows here.
             out_axes=0,
             axis_name=DATA_AXIS,
         )
     )
-    learner = setup.learner
+    learner = td3.learner
     for number in range(4):
         key = jax.random.key(number)
-        everywhere, metrics = many(learner, setup.hyper, split, key)
-        learner, expected = one(learner, setup.hyper, window, key)
+        everywhere, metrics = many(learner, td3.hyper, split, key)
+        learner, expected = td3.update(learner, td3.hyper, window, key)
         for shard in range(shards):
             ours = jax.tree.map(lambda leaf, i=shard: leaf[i], everywhere)
             assert largest_difference(ours, learner) < 1e-5
