@@ -10,8 +10,8 @@ which was written down before any of them was run: all ten are to be read togeth
 `sacformer-path` is what preset `best` was when the first five were run; what it is now was tuned
 on other seeds (improve.py). Beside these both agents with preset `cpu` (SAC as published: single
 steps, one-step targets), and presets `paper` and `authors` with the first three seeds, reduced to
-what finishes: environments, blocks, windows and updates as of `cpu`, but their width of 128, and a
-prefill of 10,000 steps instead of 4,000, which the presets that wait for finished episodes need.
+what finishes: environments, blocks, number of windows and updates as of `cpu`, but their width of
+128, and a prefill of 10,000 steps, not 4,000, as these presets wait for finished episodes.
 
 With preset `memory` SAC sees the last 6 observations with the actions between them, SACFormer the
 same in tokens, and neither of them a return-to-go. SAC's one-step targets are there, too: on the

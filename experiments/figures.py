@@ -2,11 +2,11 @@
 
 python experiments/figures.py                     # of every study
 python experiments/figures.py figure2-cpu         # of one
-python experiments/figures.py arena-hidden arena-delay --together arena-memory  # of two as one
 
 Beside STUDY.csv it writes STUDY.png and STUDY.svg (learning curves), STUDY-scores.png and .svg
 (intervals, where there are six variants or more), STUDY.md and STUDY-scores.csv. The same table
-gives the same bytes. With ``--together NAME`` it writes NAME.md alone, over all their tasks.
+gives the same bytes. Where a study is one of several in ``TOGETHER`` that are there, what these
+come to over all their tasks is written, too.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ from report.lines import is_study_table, read_study
 from report.page import FONTS
 from report.styles import MOST_LINES
 from report.tables import aggregates, markdown, scores_csv
-from report.together import together_markdown
+from report.together import can_compare, together_markdown
 
 RESULTS = Path(__file__).parent / "results"
 INTERVALS_FROM = 6
 """Variants from which on there is a figure of intervals."""
+TOGETHER = {"arena-memory": ("arena-hidden", "arena-delay")}
+"""Studies whose tasks are told of as one, too, by the name of what is written."""
 _DPI = 200
 
 
@@ -68,31 +70,21 @@ def draw(table: Path, baseline: str | None = None) -> list[Path]:
         if len(study.variants) >= INTERVALS_FROM and rated > 1:
             intervals = intervals_figure(study, made, baseline)
             paths += _save(intervals, table.with_name(f"{study.name}-scores"))
+    return paths + _draw_together(table, baseline)
+
+
+def _draw_together(table: Path, baseline: str) -> list[Path]:
+    """What the study and those that go with it come to, where they have finished the baseline."""
+    paths = []
+    for name, parts in TOGETHER.items():
+        tables = [table.with_name(f"{part}.csv") for part in parts]
+        if table.stem not in parts or not all(one.exists() for one in tables):
+            continue
+        studies = [study for study in map(read_study, tables) if study and study.last_step]
+        if len(studies) == len(parts) and all(can_compare(one, baseline) for one in studies):
+            paths.append(table.with_name(f"{name}.md"))
+            paths[-1].write_text(together_markdown(name, studies, baseline))
     return paths
-
-
-def draw_together(to: Path, tables: Sequence[Path], baseline: str | None = None) -> Path:
-    """Writes what variants come to over the tasks of several studies together.
-
-    Args:
-      to: the file, ``results/NAME.md``.
-      tables: ``results/STUDY.csv`` of each.
-      baseline: as for one study; default: that of the first.
-
-    Returns:
-      the file.
-
-    Raises:
-      ValueError: one has no evaluation yet, or see ``together_markdown``.
-    """
-    studies = []
-    for table in tables:
-        study = read_study(table)
-        if study is None or not study.last_step:
-            raise ValueError(f"study {table.stem}: has no evaluation yet")
-        studies.append(study)
-    to.write_text(together_markdown(to.stem, studies, baseline or studies[0].baseline()))
-    return to
 
 
 def _save(figure: Figure, stem: Path) -> list[Path]:
@@ -124,22 +116,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Figures and tables of studies.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="default: all in the folder")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
-    parser.add_argument("--together", metavar="NAME", help="the studies as one, in NAME.md")
     parser.add_argument("--baseline", help="the variant that others are compared with")
     args = parser.parse_args(arguments)
     there = {path.stem: path for path in sorted(args.results.glob("*.csv")) if is_study_table(path)}
     unknown = [name for name in args.studies if name not in there]
     if unknown:
         parser.error(f"{', '.join(unknown)}: no such table; there are {', '.join(there)}")
-    if args.together is not None and len(args.studies) < 2:
-        parser.error("--together: name two studies or more")
-    for name in [args.together] if args.together else args.studies or there:
+    for name in args.studies or there:
         try:
-            if args.together:
-                tables = [there[study] for study in args.studies]
-                paths = [draw_together(args.results / f"{name}.md", tables, args.baseline)]
-            else:
-                paths = draw(there[name], args.baseline)
+            paths = draw(there[name], args.baseline)
         except ValueError as error:
             parser.error(str(error))
         print(f"{name}: {', '.join(path.name for path in paths) or 'nothing to draw yet'}")

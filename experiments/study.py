@@ -262,17 +262,19 @@ class Study:
         those of a run that goes further there, as where it was trained on another machine.
         """
         with self._table_alone():
-            there = furthest(read_table(self.table))
-            new = {}
-            for name in names:
-                rows = self.rows(name)
-                here = furthest(rows).get(name, 0)
-                if here < there.get(name, 0):
+            there, new = read_table(self.table), {}
+            for name, rows in ((name, self.rows(name)) for name in names):
+                if not rows:
+                    continue
+                ours = rows[-1]["settings"]
+                same = [row for row in there if (row.get("settings") or ours) == ours]
+                here, known = furthest(rows)[name], furthest(same).get(name, 0)
+                if here < known:
                     print(
-                        f"{name}: {self.table.name} has {there[name]:,} env steps of it, "
+                        f"{name}: {self.table.name} has {known:,} env steps of it, "
                         f"{self._folder(name).path} {here:,}; those in the table stay"
                     )
-                elif rows:
+                else:
                     new[name] = rows
             if write_table(self.table, new, list(self.configs)):
                 figures.draw(self.table)
@@ -283,7 +285,8 @@ class Study:
         self.table.parent.mkdir(parents=True, exist_ok=True)
         folder = os.open(self.table.parent, os.O_RDONLY)
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX)
+            with contextlib.suppress(OSError):  # there are file systems without locks
+                fcntl.flock(folder, fcntl.LOCK_EX)
             yield
         finally:
             os.close(folder)

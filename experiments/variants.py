@@ -17,7 +17,8 @@ from study import Study
 from sacformer_jax import Config
 
 SMALL: dict[str, Any] = {"total_env_steps": 50_000, "actor_width": 32, "critic_width": 128}
-# What `cpu` sets for speed, for the other presets; of the prefill whole episodes are replayed.
+# What `cpu` sets for speed, for the other presets. The prefill is longer, as they replay only whole
+# episodes.
 LIKE_CPU: dict[str, Any] = {
     "num_envs": 8,
     "prefill_env_steps": 10_000,

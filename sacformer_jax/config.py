@@ -126,7 +126,7 @@ class ContextConfig:
     """Steps of a window that are learnt from; None: K (sacformer, sac)."""
     burn_in: int = 0
     """Steps before those of a window that are looked at but not learnt from, so that learning sees
-    as much of the past as acting does; K - 1 for all of it."""
+    more of the past; as much as acting with actor_layers times (K - 1)."""
     acting_context: ActingContext = "window"
     """In acting it sees the last K pairs, computed anew, or the episode so far, through a cache."""
     acting_context_limit: int | None = None

@@ -40,7 +40,8 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
     Raises:
       ConfigError: no such member, or one twice.
       CheckpointError: there is no checkpoint, or the new folder holds something already or cannot
-        be written. It is there as a whole or not at all.
+        be written. The run is there as a whole or not at all (after a kill the folder may hold
+        parts of it, which are no run).
     """
     folder, target = RunFolder(path).opened(), RunFolder(to)
     _check_new(target.path)

@@ -70,7 +70,7 @@ def train(
         turns out too short or a callback refuses (the folder may be used again).
       CheckpointError: the folder holds a run already or cannot be written.
       DivergedError: too many updates were not finite.
-      Exception: what a callback raised; the run was saved.
+      Exception: what a callback raised; the run was saved, if it had begun.
     """
     members = seed_members(config.all_seeds) if members is None else members
     population = make_population(config, members, devices or Devices.for_members(len(members)))
@@ -336,8 +336,16 @@ def _finished(
 def sources_of(config: Config) -> dict[str, str]:
     """Where each value of a configuration comes from: its preset, the defaults, or the user."""
     flat = config.flat()
-    chosen = {"agent": config.agent, "env": config.task.env}
-    base = resolve(config.preset, chosen)
-    given = {name for name, value in base.config.flat().items() if flat[name] != value}
-    given.add("preset")
-    return {name: "given" if name in given else base.sources[name] for name in flat}
+    given = {"agent": config.agent, "env": config.task.env}
+    base = resolve(config.preset, given).config.flat()
+    given |= {name: value for name, value in flat.items() if base[name] != value}
+    # Some values of a preset depend on what is given.
+    without = {name: {n: v for n, v in given.items() if n != name} for name in given}
+    follows = {
+        name
+        for name, others in without.items()
+        if name not in ("agent", "env")
+        and resolve(config.preset, others).config.flat()[name] == flat[name]
+    }
+    kept = {name: value for name, value in given.items() if name not in follows}
+    return {**resolve(config.preset, kept).sources, "preset": "given"}

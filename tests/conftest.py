@@ -66,7 +66,9 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()
 
 
-_LOOK_AT_PICTURES = {"test_runs", "test_diagnostics", "test_cli", "test_sweep", "test_study"}
+_LOOK_AT_PICTURES = {
+    "test_runs", "test_render", "test_diagnostics", "test_cli", "test_sweep", "test_study",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -31,7 +31,9 @@ from sacformer_jax.callbacks import Callbacks
 from sacformer_jax.digests import digest
 from sacformer_jax.logging import read_records
 from sacformer_jax.population import Population, make_population
+from sacformer_jax.restoring import Restored
 from sacformer_jax.run_folder import RunFolder
+from sacformer_jax.stored import Progress
 
 TOTAL = 600
 TINY = {
@@ -229,13 +231,25 @@ def test_an_error_at_the_start_comes_before_anything_is_computed(
         pytest.fail("something is computed")
 
     def made(*arguments: Any) -> Population:
-        return dataclasses.replace(make_population(*arguments), prefill=begun)
+        return dataclasses.replace(make_population(*arguments), prefill=begun, refill=begun)
 
     monkeypatch.setattr(runner, "make_population", made)
     seen = Recorder()
     with pytest.raises(ValueError, match="not in run"):
         train(_config(tmp_path / "run"), quiet=True, callbacks=[Failing(), seen])
     assert seen.calls == ["start", "end"]
+    # Nor is a replay that was not saved filled again.
+    path, config = tmp_path / "run", _config(tmp_path / "run").replace(checkpoint_replay=False)
+    folder = RunFolder(path)
+    folder.create(config, {}, seen.starts[0].spec, seen.starts[0].members)
+    progress = Progress(env_steps=400, best=(None, None), metrics_bytes=(0, 0))
+    restored = Restored(seen, progress, 1, {}, ())  # type: ignore[arg-type]
+    monkeypatch.setattr(RunFolder, "latest_step", lambda folder: 400)
+    monkeypatch.setattr(RunFolder, "restore", lambda *_: restored)
+    with pytest.raises(ValueError, match="not in run"):
+        resume(path, total_env_steps=1_000, quiet=True, callbacks=[Failing(), seen])
+    assert seen.calls == 2 * ["start", "end"]
+    assert (seen.starts[1].resumed, seen.starts[1].env_steps) == (True, 600)
 
 
 # --- the ready-made ones -------------------------------------------------------------------------

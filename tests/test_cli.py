@@ -1,4 +1,4 @@
-"""The command line: help, parsing, refusals, and whole runs in their own processes."""
+"""The command line: help, parsing, refusals, and whole runs."""
 
 from __future__ import annotations
 

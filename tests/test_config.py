@@ -13,6 +13,7 @@ import pytest
 
 from sacformer_jax import Config, ConfigError, config, make_program, train
 from sacformer_jax.presets import PRESETS, resolve
+from sacformer_jax.runner import sources_of
 
 ENVS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid", "brax:ant")
 AGENTS = get_args(config.AgentName)
@@ -208,6 +209,10 @@ def test_a_window_in_acting_needs_no_limit(preset: str) -> None:
     resolved.config.validated()
     assert resolved.config.context.acting_context_limit is None
     assert resolved.sources["acting_context_limit"].startswith("default")
+    given = {"env": "Ant", "acting_context": "window", "agent": "sacformer"}
+    sources = sources_of(Config.from_preset(preset, **given))  # as where nobody kept them
+    assert {name for name, source in sources.items() if source == "given"} == {"preset", *given}
+    assert sources["acting_context_limit"].startswith("default")
     own = {"acting_context": "window", "acting_context_limit": 7}
     with pytest.raises(ConfigError, match=r"acting_context_limit=7: acting_context=window shows"):
         resolve(preset, own).config.validated()

@@ -562,11 +562,19 @@ def test_tasks_without_a_scale_have_no_average(tmp_path: Path) -> None:
     made = aggregates(study, "sac")
     assert [one.iqm for one in made] == [None, None]
     assert "| TD3 | – | – | 1.00 [1.00, 1.00] on tiny only |" in markdown(study, made, "sac")
+    # A difference is of tasks with a scale, a probability of all.
+    both = read(tmp_path / "mixed.csv", runs | {"Hopper-sac": [[1], [2]], "Hopper-td3": [[3], [4]]})
+    made = aggregates(both, "sac")
+    rows = [line for line in markdown(both, made, "sac").splitlines() if "| TD3 |" in line]
+    difference, improvement = rows[-1].split(" | ")[2:]
+    assert difference.endswith("]")
+    assert improvement == "1.00 [1.00, 1.00] on Hopper, tiny only |"
 
 
 def test_studies_together_are_as_one_of_all_their_tasks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(figures, "TOGETHER", {"both": ("one", "two")})
     of = {
         "one": {"Hopper-sac": (0.1, 0.2, 0.3, 0.4), "Hopper-x": (0.5, 0.6, 0.7, 0.8)},
         "two": {"Hopper-sac": (0.0, 0.1, 0.2, 0.3), "Hopper-x": (0.1, 0.2, 0.4, 0.9),
@@ -575,9 +583,10 @@ def test_studies_together_are_as_one_of_all_their_tasks(
     for name, runs in of.items():
         lines = {run: [[r] for r in returns_for("Hopper", *of_run)] for run, of_run in runs.items()}
         write(tmp_path / f"{name}.csv", lines)
-    arguments = ["one", "two", "--results", str(tmp_path)]
-    assert figures.main([*arguments, "--together", "both"]) == 0
-    assert capsys.readouterr().out == "both: both.md\n"
+        if name == "one":
+            figures.draw(tmp_path / "one.csv")
+            assert not (tmp_path / "both.md").exists()
+    assert tmp_path / "both.md" in figures.draw(tmp_path / "two.csv")
     text = (tmp_path / "both.md").read_text()
     # Of SAC's eight scores the middle four are .1 .2 .2 .3, of the other's .4 .5 .6 .7.
     assert "| SAC | 0.20 [" in text
@@ -587,14 +596,9 @@ def test_studies_together_are_as_one_of_all_their_tasks(
     assert f"] | {(1 + 12 / 16) / 2:.2f} [" in text
     assert "| y |" not in text
     assert "one: Hopper; two: Hopper" in text
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["both.md", "one.csv", "two.csv"]
-    for wrong, why in (
-        (["one", "--together", "x"], "two studies or more"),
-        (["one", "two", "--together", "x", "--baseline", "y"], "baseline 'y': not finished"),
-    ):
-        with pytest.raises(SystemExit):
-            figures.main([*wrong, "--results", str(tmp_path)])
-        assert why in capsys.readouterr().err
+    # Nothing where a study lacks what it is compared with.
+    (tmp_path / "both.md").unlink()
+    assert tmp_path / "both.md" not in figures.draw(tmp_path / "two.csv", "y")
 
 
 def test_tables_without_rows_and_strange_arguments(

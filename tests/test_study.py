@@ -109,9 +109,17 @@ def test_a_run_that_goes_further_in_the_table_stays_there(
     study.write(["Hopper-b"])
     assert study.table.read_bytes() == finished
     assert "tiny.csv has 200 env steps of it" in capsys.readouterr().out
+    study.write(["Hopper-a"])  # of which there is nothing here: nothing is said of it
+    assert capsys.readouterr().out == ""
     _pretend(study, "Hopper-b", [5.0, 6.0], [5.0, 6.0])  # as far: the newer ones
     study.write(["Hopper-b"])
     assert study.table.read_bytes() != finished
+    # Of other settings it is not the same run.
+    study.configs["Hopper-b"] = study.configs["Hopper-b"].replace(alpha=0.123)
+    shutil.rmtree(study.runs)
+    _pretend(study, "Hopper-b", [5.0], [5.0])
+    study.write(["Hopper-b"])
+    assert {row["env_steps"] for row in read_table(study.table)} == {100}
 
 
 def test_where_a_run_was_trained_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,7 +140,10 @@ class Runs:
             contextlib.redirect_stdout(io.StringIO()) as printed,
             contextlib.redirect_stderr(io.StringIO()) as said,
         ):
-            code = main(["describe", str(run), "--json"])
+            try:
+                code = main(["describe", str(run), "--json"])
+            except Exception as error:
+                raise RuntimeError(f"{run}: {error}") from error
         if code:
             lines = said.getvalue().strip().splitlines() or ["no output"]
             raise RuntimeError(f"{run}: {lines[-1]}")

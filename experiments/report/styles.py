@@ -51,7 +51,7 @@ MOST_LINES = len(_OTHERS)
 _PALEST = 0.82
 """Where the colour map ends: what is paler does not print."""
 _DARKEST_BESIDE_AGENTS = 0.46
-"""Where it begins beside SACFormer and SAC, which are darker."""
+"""Where it begins beside two agents or more: SACFormer and SAC are darker."""
 
 
 def styles_of(variants: Sequence[str]) -> dict[str, Style]:

@@ -125,8 +125,14 @@ def _csv_rows(study: StudyLines, made: Sequence[Aggregate]) -> Iterator[tuple[An
         ):
             if estimate is not None:
                 numbers = (estimate.value, estimate.low, estimate.high)
-                of = "" if name == "iqm" or one.tasks == study.tasks else "+".join(one.tasks)
-                yield of, one.variant, name, "", *(_digits(number, 4) for number in numbers)
+                of = [] if name == "iqm" else _only(study, one, rated=name == "difference")
+                yield (
+                    "+".join(of),
+                    one.variant,
+                    name,
+                    "",
+                    *(_digits(number, 4) for number in numbers),
+                )
 
 
 def _digits(value: float, digits: int) -> str:
@@ -276,12 +282,19 @@ def _timed_table(study: StudyLines, baseline: str) -> str:
 
 def _compared(study: StudyLines, one: Aggregate | Timed) -> tuple[str, str]:
     """Difference from the baseline, and probability of improvement, with the tasks these are of."""
-    of = "" if one.tasks == study.tasks else f" on {', '.join(one.tasks)} only"
 
-    def cell(estimate: Estimate | None) -> str:
-        return bracketed(estimate) + (of if estimate is not None else "")
+    def cell(estimate: Estimate | None, rated: bool) -> str:
+        only = _only(study, one, rated) if estimate is not None else []
+        return bracketed(estimate) + (f" on {', '.join(only)} only" if only else "")
 
-    return cell(one.difference), cell(one.improvement)
+    return cell(one.difference, rated=True), cell(one.improvement, rated=False)
+
+
+def _only(study: StudyLines, one: Aggregate | Timed, rated: bool) -> list[str]:
+    """The tasks that a comparison is of, where that is not all (that have normalized scores)."""
+    all_of_them = rated_tasks(study) if rated else study.tasks
+    tasks = [task for task in one.tasks if task in all_of_them]
+    return [] if tasks == all_of_them else tasks
 
 
 def bracketed(estimate: Estimate | None) -> str:

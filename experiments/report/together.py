@@ -18,27 +18,24 @@ from report.scores import (
 from report.tables import bracketed, rated_tasks, table
 
 
+def can_compare(study: StudyLines, baseline: str) -> bool:
+    """Whether it has finished the baseline on all its tasks, and these have normalized scores."""
+    return rated_tasks(study) == study.tasks == study.finished_tasks(baseline)
+
+
 def together_markdown(name: str, studies: Sequence[StudyLines], baseline: str) -> str:
     """The text of ``NAME.md``: every variant that all studies have finished on all their tasks.
 
     Args:
       name: of the text.
       studies: their tasks count as different ones, each the same.
-      baseline: the variant that others are compared with.
-
-    Raises:
-      ValueError: a study has not finished the baseline, or has a task without normalized scores.
+      baseline: the variant that others are compared with; see :func:`can_compare`.
     """
-    for study in studies:
-        if rated_tasks(study) != study.tasks:
-            raise ValueError(f"study {study.name}: not all tasks have normalized scores")
     variants = [
         variant
         for variant in studies[0].variants
         if all(study.finished_tasks(variant) == study.tasks for study in studies)
     ]
-    if baseline not in variants:
-        raise ValueError(f"baseline {baseline!r}: not finished on all tasks of these studies")
 
     def scores(variant: str) -> list[np.ndarray]:
         lines = [study.lines[task, variant] for study in studies for task in study.tasks]
@@ -60,8 +57,8 @@ def together_markdown(name: str, studies: Sequence[StudyLines], baseline: str) -
     head = ["", "interquartile mean", f"less {other}'s", f"P(better than {other})"]
     return (
         f"# {name}\n\n"
-        f"Made by `python experiments/figures.py {' '.join(names)} --together {name}` of what each "
-        "study has by itself.\n\n"
+        f"Made by `python experiments/figures.py {names[0]}` from the tables of these studies: "
+        f"{', '.join(names)}.\n\n"
         f"Interquartile mean of normalized scores over all runs of all tasks ({tasks}): 0 is "
         f"random actions, 1 is {REFERENCE_SOURCE}. Its difference from {other}'s, and the "
         f"probability that a run is better than one of {other}, mean over tasks. In brackets 95 % "
