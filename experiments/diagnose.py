@@ -19,7 +19,9 @@ Of the newest checkpoint of each run, replay included, of agent sacformer or sac
   those in evaluation outside the 1st to 99th percentile of training;
 - evaluation return from the same resets as it is, with the newest pair alone, with the time step
   held at 0, with the target return halved and doubled; and the mean absolute change of the mean
-  action on replayed states, in half ranges of the action bounds.
+  action on replayed states, in half ranges of the action bounds;
+- how far features and mean actions of a window's steps, of the first and the last one learnt from
+  and of the first of all, lie from those in acting, which sees another length of the past.
 
 python experiments/diagnose.py runs/sacformer runs/sac --json diagnosis.json --picture diagnosis.png
 """

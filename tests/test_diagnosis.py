@@ -31,6 +31,7 @@ from diagnosis.numbers import (
 from diagnosis.picture import KINDS
 from diagnosis.subject import Subject, contexts_of, full_windows, make_tools, subjects
 from diagnosis.values import Episodes, judged, make_judge, make_sampler
+from diagnosis.window import window_numbers
 from PIL import Image
 from probe import EPISODE, point_config, point_env
 from untrained import untrained_config
@@ -411,12 +412,39 @@ def test_contexts_are_those_of_the_windows_ends(sacformer: Subject) -> None:
     np.testing.assert_array_equal(contexts.time_step[:, 1], windows.time_step[:, 2])
 
 
+def test_steps_of_windows_beside_acting(sacformer: Subject, sac: Subject) -> None:
+    """Acting on windows of three, the last step of a window is as in acting, the others are not; of
+    a policy that acts on the episode, none is.
+    """
+    episodes = jax.device_get(
+        make_sampler(point_env(2), sacformer.tools.parts)(sacformer.policy, jax.random.key(5))
+    )
+    found = window_numbers(sacformer, episodes)
+    assert found["window/feature_change/last_learnt"] < 1e-5
+    assert found["window/action_change/last_learnt"] < 1e-5
+    assert found["window/feature_change/first_learnt"] == found["window/feature_change/first"]
+    assert found["window/feature_change/first"] > 0.01
+    assert found["window/action_change/first"] > 1e-4
+    assert window_numbers(sac, episodes) == {}
+    short = episodes.replace(done=episodes.done | (np.arange(EPISODE)[:, None] == 4))
+    assert window_numbers(sacformer, short) == {}  # no window begins three steps in
+    whole = dataclasses.replace(
+        sacformer.tools.program, config=sacformer.config.replace(acting_context="episode")
+    )
+    acts_on_it = dataclasses.replace(
+        sacformer, tools=dataclasses.replace(sacformer.tools, program=whole)
+    )
+    found = window_numbers(acts_on_it, episodes)
+    assert found["window/feature_change/last_learnt"] > 0.01
+    assert found["window/feature_change/first"] > found["window/feature_change/last_learnt"]
+
+
 # --- the script ----------------------------------------------------------------------------------
 
 FEW = ["--batches", "3", "--episodes", "2", "--windows", "20"]
 SECTIONS = {
     "env_steps", "updates", "batch", "gradient", "entropy", "alpha", "q_bias", "srank", "dormant",
-    "attention", "return_tokens", "history",
+    "attention", "return_tokens", "history", "window",
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from diagnosis.history import Tokens, history_numbers, make_actor, return_tokens
 from diagnosis.networks import attention_numbers, representation_numbers
 from diagnosis.subject import Subject, draws, full_windows, subjects
 from diagnosis.values import Judged, judged, make_judge, make_sampler, value_numbers
+from diagnosis.window import window_numbers
 from sacformer_jax.train import make_training_env
 
 
@@ -103,6 +104,7 @@ def _measure_of(first: Subject, amounts: Amounts) -> Callable[[Subject], Diagnos
             **attention_numbers(subject, windows),
             **token_numbers(tokens),
             **history_numbers(subject, actor, recording, windows, seed),
+            **window_numbers(subject, episodes),
         }
         return Diagnosis(subject.member, numbers, steps, tokens)
 

@@ -24,6 +24,7 @@ _SECTIONS = {
     "attention": "attention of the state acted on",
     "return_tokens": "return tokens, scaled",
     "history": "what acting sees: evaluation return, change of actions",
+    "window": "steps of a window beside acting: change of features, of actions",
 }
 _ONLY_IN_JSON = re.compile(r"attention/.*_back/")
 
