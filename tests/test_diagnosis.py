@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from diagnosis.gradients import by_group, make_gradients, update_of
 from diagnosis.history import Change, _without_time, acting_agent
-from diagnosis.networks import activations, inputs_of
+from diagnosis.networks import activations, inputs_of, representation_numbers
 from diagnosis.numbers import (
     dormant_share,
     effective_rank,
@@ -410,6 +410,17 @@ def test_contexts_are_those_of_the_windows_ends(sacformer: Subject) -> None:
     np.testing.assert_array_equal(contexts.action[:, 0], windows.action[:, 1])
     assert not contexts.action[:, 1].any()
     np.testing.assert_array_equal(contexts.time_step[:, 1], windows.time_step[:, 2])
+
+
+def test_what_acting_does_not_compute_is_not_looked_at() -> None:
+    program = make_program(
+        point_config(context_length=3, prediction_weight=1.0, **POINT), point_env(4)
+    )
+    state, _ = program.prefill(program.init(jax.random.key(0)))
+    foretelling = Subject("seed-0", make_tools(program), state)
+    numbers = representation_numbers(foretelling, full_windows(foretelling, 16, seed=0))
+    assert "dormant/actor/block_0" in numbers
+    assert not any("prediction" in name for name in numbers)
 
 
 def test_steps_of_windows_beside_acting(sacformer: Subject, sac: Subject) -> None:

@@ -106,9 +106,12 @@ def activations(run: Callable[..., Any], *arguments: Any) -> Activations:
     with nn.intercept_methods(look):
         # A function of its own: what was traced before would be run again as it was.
         seen.output = jax.device_get(jax.jit(lambda *given: run(*given))(*arguments))
-    # In the order of the layers, not of the calls.
+    # In the order of the layers, not of the calls. What no output needs (in acting, a prediction)
+    # was not computed.
     seen.layers = {
-        name: np.asarray(of(jnp.asarray(before[name]))) for name, of in functions.items()
+        name: np.asarray(of(jnp.asarray(before[name])))
+        for name, of in functions.items()
+        if name in before
     }
     return seen
 
