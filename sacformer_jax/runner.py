@@ -127,14 +127,13 @@ def resume(
             f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
             f"{latest} already; give more with --total-env-steps"
         )
-    if latest is not None and not config.run.checkpoint_replay:
-        again = config.env_steps_of_prefill
-        if latest + again >= config.run.total_env_steps:
-            raise ConfigError(
-                f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
-                f"{latest}, and its replay, which was not saved, takes {again} to fill again; give "
-                "more with --total-env-steps"
-            )
+    again = 0 if config.run.checkpoint_replay else config.env_steps_of_prefill
+    if latest is not None and latest + again >= config.run.total_env_steps:
+        raise ConfigError(
+            f"total_env_steps={config.run.total_env_steps}: run {str(folder.path)!r} has done "
+            f"{latest}, and its replay, which was not saved, takes {again} to fill again; give "
+            "more with --total-env-steps"
+        )
     population = make_population(config, run.members, devices or Devices.for_members(num_members))
     check_memory(population)
 
@@ -149,9 +148,7 @@ def resume(
             )
             for damaged in restored.moved_aside:
                 reporter.say(f"note: {damaged}")
-            progress, again = restored.progress, 0
-            if not config.run.checkpoint_replay:
-                again = config.env_steps_of_prefill
+            progress = restored.progress
             reporter.facts(population, folder.path)
             reporter.say(f"resuming at  {progress.env_steps:,} env steps")
             now = _split_over(xla_threads(), dataclasses.asdict(population.devices))
@@ -339,13 +336,11 @@ def sources_of(config: Config) -> dict[str, str]:
     given = {"agent": config.agent, "env": config.task.env}
     base = resolve(config.preset, given).config.flat()
     given |= {name: value for name, value in flat.items() if base[name] != value}
-    # Some values of a preset depend on what is given.
-    without = {name: {n: v for n, v in given.items() if n != name} for name in given}
-    follows = {
-        name
-        for name, others in without.items()
-        if name not in ("agent", "env")
-        and resolve(config.preset, others).config.flat()[name] == flat[name]
-    }
-    kept = {name: value for name, value in given.items() if name not in follows}
+
+    def follows(name: str) -> bool:
+        """Whether the preset itself comes to the value, given the others."""
+        others = {other: value for other, value in given.items() if other != name}
+        return resolve(config.preset, others).config.flat()[name] == flat[name]
+
+    kept = {n: value for n, value in given.items() if n in ("agent", "env") or not follows(n)}
     return {**resolve(config.preset, kept).sources, "preset": "given"}
