@@ -36,6 +36,7 @@ from sacformer_jax import (
 )  # fmt: skip
 from sacformer_jax.checkpoint import RunConfigFile, RunFolder
 from sacformer_jax.cli import EXIT_INTERRUPTED, Parsed, exit_code, parse_config
+from sacformer_jax.launch import choose_cpu_devices, choose_xla_threads
 from sacformer_jax.processes import is_first
 from sacformer_jax.types import Hyperparameters
 from sacformer_jax.values import unknown
@@ -249,8 +250,10 @@ def sweep(args: argparse.Namespace, flags: list[str]) -> int:
     if not config.run.run_dir:
         raise ConfigError("run_dir='': give a folder, so that the same command can go on there")
     members = members_of(settings, config)
-    launch.join()
     folder = RunFolder(config.run.run_dir)
+    choose_xla_threads(config)
+    choose_cpu_devices(launch, len(members), folder.latest_devices().get("members"))
+    launch.join()
     try:
         done = train_or_resume(parsed, members, launch.devices(len(members)))
     except DivergedError:

@@ -16,7 +16,7 @@ import tyro
 from sacformer_jax import commands, compilation_cache, picture_commands
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.config import Config, ConfigError
-from sacformer_jax.launch import Launch, choose_xla_threads
+from sacformer_jax.launch import Launch, choose_cpu_devices, choose_xla_threads
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.presets import Resolved, resolve
 from sacformer_jax.tracking import Tracking, resumed_tracking
@@ -155,9 +155,11 @@ def _train(args: list[str]) -> int:
     parsed = parse_config(args, "sacformer train")
     config, launch = parsed.resolved.config.validated(), parsed.launch
     callbacks = parsed.tracking.callbacks()
+    num_members = len(config.all_seeds)
     choose_xla_threads(config)
+    choose_cpu_devices(launch, num_members)
     launch.join()
-    devices = launch.devices(len(config.all_seeds))
+    devices = launch.devices(num_members)
     result = train(config, parsed.resolved.sources, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0
 
@@ -166,11 +168,14 @@ def _resume(args: list[str]) -> int:
     from sacformer_jax.runner import resume
 
     parsed = tyro.cli(ResumeArgs, args=args, prog="sacformer resume")
-    known = RunFolder(parsed.run).opened().read_config()
+    folder = RunFolder(parsed.run).opened()
+    known, launch = folder.read_config(), parsed.launch
+    num_members = len(known.members)
     choose_xla_threads(known.config)
-    parsed.launch.join()
-    devices = parsed.launch.devices(len(known.members))
-    callbacks = resumed_tracking(RunFolder(parsed.run).path)
+    choose_cpu_devices(launch, num_members, folder.latest_devices().get("members"))
+    launch.join()
+    devices = launch.devices(num_members)
+    callbacks = resumed_tracking(folder.path)
     result = resume(parsed.run, parsed.total_env_steps, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0
 

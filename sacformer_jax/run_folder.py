@@ -175,6 +175,18 @@ class RunFolder:
         """Environment steps of the newest checkpoint; None without any."""
         return max(self.steps(), default=None)
 
+    def latest_devices(self) -> dict[str, int]:
+        """Over how many devices what is split in the newest checkpoint whose metadata is good, by
+        name; empty where that is not known.
+        """
+        for step in reversed(self.steps()):
+            try:
+                metadata = stored.read_metadata(self.checkpoints_path / str(step))
+            except (stored.DamagedError, CheckpointError):  # restoring it tells
+                continue
+            return metadata.get("devices") or {}
+        return {}
+
     def restore(
         self,
         abstract_state: TrainState,

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import jaxlib
 import pytest
 from compiling import QUICK_LOOPS
@@ -61,7 +62,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Leaves what is there by now out of every later collection, of which some tests make many."""
+    """Leaves what is there by now out of every later collection, of which some tests make many.
+
+    And has JAX make its devices: a command called as a function would choose how many otherwise.
+    """
+    jax.devices()
     gc.collect()
     gc.freeze()
 

@@ -17,6 +17,7 @@ from describing import described
 
 from sacformer_jax import Config, load_policy, resume, train
 from sacformer_jax.cli import main
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.logging import read_records
 
 TINY = {
@@ -28,12 +29,15 @@ TINY = {
 STOP, TOTAL = 400, 600
 
 
-def _environment(num_devices: int) -> dict[str, str]:
+def _environment(num_devices: int | None) -> dict[str, str]:
+    """Of a process with so many devices; None: with those that the command line chooses."""
+    if num_devices is None:
+        return dict(os.environ)
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={num_devices}"
     return {**os.environ, "XLA_FLAGS": flags}
 
 
-def _start(num_devices: int, *args: object) -> subprocess.Popen[str]:
+def _start(num_devices: int | None, *args: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "sacformer_jax.cli", *map(str, args)],
         env=_environment(num_devices),
@@ -52,7 +56,7 @@ def _finish(process: subprocess.Popen[str], code: int = 0) -> str:
     return out
 
 
-def _sacformer(num_devices: int, *args: object) -> str:
+def _sacformer(num_devices: int | None, *args: object) -> str:
     return _finish(_start(num_devices, *args))
 
 
@@ -123,6 +127,26 @@ def test_saved_on_eight_devices_and_restored_on_one(on_eight: Path, tmp_path: Pa
     obs = np.zeros(11, np.float32)
     for seed in (0, 1):  # a policy saved there acts here
         assert np.isfinite(load_policy(on_eight, "latest", seed).predict(obs)[0]).all()
+
+
+def test_seeds_begun_on_one_device_stay_there(
+    stopped: Path, straight: Path, tmp_path: Path
+) -> None:
+    path = _copy(stopped, tmp_path / "run")
+    said = _sacformer(None, "resume", path, "--total-env-steps", TOTAL)
+    assert "for the members" not in said  # neither of devices, nor that bits would differ
+    assert _digest(path) == _digest(straight)
+
+
+@pytest.mark.skipif(usable_cores() < 2, reason="a core for each of two seeds is what is tested")
+def test_seeds_begun_on_cores_of_their_own_stay_there(straight: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    devices = "devices 2 for the members times 1 for the data of each, 1 processes"
+    assert devices in " ".join(_sacformer(None, "train", *_flags(path, STOP)).split())
+    said = _sacformer(None, "resume", path, "--total-env-steps", TOTAL)
+    assert devices in " ".join(said.split())
+    assert "bit for bit" not in said
+    np.testing.assert_allclose(_losses(path), _losses(straight), rtol=1e-3)
 
 
 @pytest.mark.slow
