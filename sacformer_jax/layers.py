@@ -30,6 +30,44 @@ Initializer = Callable[..., jax.Array]
 Residuals = tuple[Any, ...]
 
 
+def orthogonal(scale: float) -> Initializer:
+    """``scale`` times a random orthogonal matrix, as of ``flax.linen.initializers.orthogonal``.
+
+    The same matrix from the same key, up to rounding, by Gram-Schmidt instead of LAPACK's QR: that
+    of jaxlib 0.10.2 waits inside a thread of XLA's for others of its pool, and where as many
+    factorizations run at once as there are threads, for ever.
+
+    Returns:
+      ``init(key, shape [I, O], dtype)``: rows or columns are orthonormal, whichever are fewer.
+    """
+
+    def init(key: jax.Array, shape: tuple[int, int], dtype: Any = jnp.float32) -> jax.Array:
+        inputs, outputs = shape
+        tall = (inputs, outputs) if inputs >= outputs else (outputs, inputs)
+        columns = _orthonormal_columns(jax.random.normal(key, tall))
+        return (scale * (columns if inputs >= outputs else columns.T)).astype(dtype)
+
+    return init
+
+
+# In turns under vmap, so that a matrix is the same to the bit alone and among others.
+@jax.custom_batching.sequential_vmap
+def _orthonormal_columns(matrix: jax.Array) -> jax.Array:
+    """Q of QR with a positive diagonal of R, ``[M, N]`` with M at least N.
+
+    Each column is made orthogonal twice, which is enough for float32's precision (Giraud et al.
+    2005, doi:10.1007/s00211-005-0615-4).
+    """
+
+    def with_column(place: jax.Array, columns: jax.Array) -> jax.Array:
+        column = matrix[:, place]  # those not yet there are zeros in `columns`
+        for _ in range(2):
+            column = column - columns @ (column @ columns)
+        return columns.at[:, place].set(column / jnp.linalg.norm(column))
+
+    return jax.lax.fori_loop(0, matrix.shape[1], with_column, jnp.zeros_like(matrix))
+
+
 def _laid_out(x: jax.Array) -> jax.Array:
     """``x`` as it is, written to memory on CPUs.
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from sacformer_jax.cache import cache_places
 from sacformer_jax.config import Tokens
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.layers import Dense, LayerNorm
+from sacformer_jax.layers import Dense, LayerNorm, orthogonal
 from sacformer_jax.transformer import (
     ACTIVATIONS,
     Seen,
@@ -29,7 +29,7 @@ _PREDICTION_RATIO = 4
 KERNEL_INITS = {
     "lecun": nn.initializers.lecun_uniform(),
     "xavier": nn.initializers.xavier_uniform(),
-    "orthogonal": nn.initializers.orthogonal(math.sqrt(2.0)),
+    "orthogonal": orthogonal(math.sqrt(2.0)),
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gpt2 import randomized
 
-from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend
+from sacformer_jax.layers import Dense, Dropout, LayerNorm, attend, orthogonal
 
 LEADING = {"rows": (7,), "sequences": (3, 5)}
 
@@ -168,3 +168,25 @@ def test_dropout_without_a_key_is_off():
     x = numbers(3, 4)
     assert Dropout(None, 0.5, 12).factors((3, 4)) is None
     assert Dropout(None)(x) is x
+
+
+# --- initialization -------------------------------------------------------------------------------
+
+SHAPES = [(17, 64), (376, 64), (64, 64), (64, 1), (1, 5), (256, 256)]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_orthogonal_matrices_are_flax_s(shape):
+    key = jax.random.key(3)
+    kernel = jax.jit(lambda key: orthogonal(0.5)(key, shape))(key)
+    np.testing.assert_allclose(kernel, nn.initializers.orthogonal(0.5)(key, shape), atol=5e-6)
+    ours = np.asarray(kernel if shape[0] >= shape[1] else kernel.T, np.float64) / 0.5
+    np.testing.assert_allclose(ours.T @ ours, np.eye(min(shape)), atol=2e-6)
+
+
+def test_orthogonal_matrices_are_the_same_among_others():
+    keys = jax.random.split(jax.random.key(0), 3)
+    together = jax.jit(jax.vmap(lambda key: orthogonal(1.0)(key, (20, 8))))(keys)
+    alone = jax.jit(lambda key: orthogonal(1.0)(key, (20, 8)))
+    for key, kernel in zip(keys, together, strict=True):
+        np.testing.assert_array_equal(kernel, alone(key))

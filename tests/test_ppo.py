@@ -813,6 +813,12 @@ def test_a_run_from_the_command_line_resumes_to_the_bit(
         assert ours.read_bytes() == theirs.read_bytes()
 
 
+def test_nothing_of_lapack_is_called() -> None:
+    """Its QR waits for XLA's other threads, and several at once for ever (see ``orthogonal``)."""
+    population = make_population(Config.from_preset("cpu", **TINY), seed_members(range(2)))
+    assert "lapack" not in jax.jit(population.init).lower().as_text()
+
+
 @pytest.mark.slow
 def test_an_exported_policy_is_the_mean_within_the_bounds(tmp_path: Path) -> None:
     path = train(Config.from_preset("cpu", **TINY, run_dir=str(tmp_path / "run")), quiet=True).path

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from sacformer_jax.agents.core import AgentParts
 from sacformer_jax.config import PpoConfig
 from sacformer_jax.envs.core import EnvSpec
-from sacformer_jax.layers import Dense
+from sacformer_jax.layers import Dense, orthogonal
 from sacformer_jax.networks import MLP, GaussianParams
 from sacformer_jax.types import Acted, Context, Params, PolicyState
 
@@ -43,7 +43,7 @@ class PpoActor(nn.Module):
     def __call__(self, obs: jax.Array) -> GaussianParams:
         """``obs [..., O]``, normalized -> ``[..., A]``; of the Gaussian itself, without tanh."""
         mlp = MLP(self.widths, self.activation, False, self.dtype, "orthogonal", name="mlp")
-        init = nn.initializers.orthogonal(self.head_init_scale)
+        init = orthogonal(self.head_init_scale)
         mean = Dense(self.action_size, init, name="mean")(mlp(obs))
         log_std = self.param("log_std", nn.initializers.zeros_init(), (self.action_size,))
         return GaussianParams(mean, jnp.broadcast_to(log_std, mean.shape))
@@ -63,7 +63,7 @@ class PpoCritic(nn.Module):
         mlp = MLP(
             self.widths, self.activation, self.layer_norm, self.dtype, "orthogonal", name="mlp"
         )
-        return Dense(1, nn.initializers.orthogonal(1.0), name="value")(mlp(obs))[..., 0]
+        return Dense(1, orthogonal(1.0), name="value")(mlp(obs))[..., 0]
 
 
 def log_prob(gaussian: GaussianParams, sample: jax.Array) -> jax.Array:
