@@ -252,7 +252,7 @@ def sweep(args: argparse.Namespace, flags: list[str]) -> int:
     members = members_of(settings, config)
     folder = RunFolder(config.run.run_dir)
     choose_xla_threads(config)
-    choose_cpu_devices(launch, len(members), folder.latest_devices().get("members"))
+    choose_cpu_devices(config, launch, len(members), folder.latest_devices().get("members"))
     launch.join()
     try:
         done = train_or_resume(parsed, members, launch.devices(len(members)))

@@ -157,7 +157,7 @@ def _train(args: list[str]) -> int:
     callbacks = parsed.tracking.callbacks()
     num_members = len(config.all_seeds)
     choose_xla_threads(config)
-    choose_cpu_devices(launch, num_members)
+    choose_cpu_devices(config, launch, num_members)
     launch.join()
     devices = launch.devices(num_members)
     result = train(config, parsed.resolved.sources, devices=devices, callbacks=callbacks)
@@ -172,7 +172,7 @@ def _resume(args: list[str]) -> int:
     known, launch = folder.read_config(), parsed.launch
     num_members = len(known.members)
     choose_xla_threads(known.config)
-    choose_cpu_devices(launch, num_members, folder.latest_devices().get("members"))
+    choose_cpu_devices(known.config, launch, num_members, folder.latest_devices().get("members"))
     launch.join()
     devices = launch.devices(num_members)
     callbacks = resumed_tracking(folder.path)

@@ -11,6 +11,7 @@ import jax
 
 from sacformer_jax.config import Config, ConfigError
 from sacformer_jax.cores import usable_cores
+from sacformer_jax.envs.tasks import TASKS
 from sacformer_jax.population import Devices
 from sacformer_jax.values import first_line
 
@@ -88,16 +89,23 @@ def choose_xla_threads(config: Config) -> None:
         os.environ.setdefault("PJRT_NPROC", "1")
 
 
-def choose_cpu_devices(launch: Launch, num_members: int, begun_with: int | None = None) -> None:
+def choose_cpu_devices(
+    config: Config, launch: Launch, num_members: int, begun_with: int | None = None
+) -> None:
     """Makes the cores of a CPU devices, as many as the members are split over.
 
     One device splits every operation among the cores, and of networks as small as these handing
     over costs much of what that gains; with members on cores of their own several train 1.3 to 1.5
-    times as fast (docs/scaling.md). To be called before JAX is used, later it changes nothing. Who
-    says how many devices a CPU has, by ``JAX_NUM_CPU_DEVICES`` or XLA's flag, decides for
-    themselves, and several processes get no more than one each.
+    times as fast (docs/scaling.md). That was measured, and is done, with MuJoCo tasks on engine
+    native: physics in JAX factorizes matrices by LAPACK, whose kernels in jaxlib 0.10.2 wait for
+    threads that the devices share (see :func:`sacformer_jax.layers.orthogonal`).
+
+    To be called before JAX is used, later it changes nothing. Who says how many devices a CPU has,
+    by ``JAX_NUM_CPU_DEVICES`` or XLA's flag, decides for themselves, and several processes get no
+    more than one each.
 
     Args:
+      config: of the run.
       launch: what the command line says.
       num_members: of the run.
       begun_with: devices that the members of a resumed run were split over, as only with the same
@@ -106,6 +114,8 @@ def choose_cpu_devices(launch: Launch, num_members: int, begun_with: int | None 
     settings: Any = jax.config  # has its options as attributes, which its type does not know
     by_flag = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if launch.one_of_several or by_flag or settings.jax_num_cpu_devices >= 0:
+        return
+    if config.task.env not in TASKS or config.task.engine == "mjx":
         return
     data, cores = max(1, launch.data_devices), usable_cores()
     fitting = [n for n in range(1, max(1, cores // data) + 1) if num_members % n == 0]

@@ -78,7 +78,7 @@ def test_members_have_a_core_each_as_far_as_there_are_some(
     begun_with: int | None,
     expected: int | None,
 ) -> None:
-    choose_cpu_devices(launch, members, begun_with)
+    choose_cpu_devices(Config(), launch, members, begun_with)
     assert chosen == ([] if expected is None else [("jax_num_cpu_devices", expected)])
 
 
@@ -86,18 +86,26 @@ def test_who_says_how_many_devices_a_cpu_has_decides(
     chosen: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.environ["XLA_FLAGS"] = "--xla_a=1 --xla_force_host_platform_device_count=3"
-    choose_cpu_devices(Launch(), 8)
+    choose_cpu_devices(Config(), Launch(), 8)
     os.environ["XLA_FLAGS"] = "--xla_a=1"
     with monkeypatch.context() as patched:
         patched.setattr(type(jax.config), "jax_num_cpu_devices", property(lambda _: 1))
-        choose_cpu_devices(Launch(), 8)
+        choose_cpu_devices(Config(), Launch(), 8)
     assert not chosen
-    choose_cpu_devices(Launch(), 8)
+    choose_cpu_devices(Config(), Launch(), 8)
     assert chosen == [("jax_num_cpu_devices", 4)]
+
+
+@pytest.mark.parametrize("task", [{"env": "brax:ant"}, {"engine": "mjx"}, {"env": "gym:Pusher-v5"}])
+def test_elsewhere_than_on_the_native_engine_it_is_not_done(
+    chosen: list[tuple[str, int]], task: dict[str, str]
+) -> None:
+    choose_cpu_devices(Config().replace(**task), Launch(), 8)
+    assert not chosen
 
 
 def test_where_jax_has_been_used_its_devices_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sacformer_jax.launch.usable_cores", lambda: jax.device_count() + 1)
     before = jax.devices()
-    choose_cpu_devices(Launch(), jax.device_count() + 1)
+    choose_cpu_devices(Config(), Launch(), jax.device_count() + 1)
     assert jax.devices() == before
