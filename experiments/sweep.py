@@ -36,7 +36,6 @@ from sacformer_jax import (
 )  # fmt: skip
 from sacformer_jax.checkpoint import RunConfigFile, RunFolder
 from sacformer_jax.cli import EXIT_INTERRUPTED, Parsed, exit_code, parse_config
-from sacformer_jax.launch import choose_cpu_devices, choose_xla_threads
 from sacformer_jax.processes import is_first
 from sacformer_jax.types import Hyperparameters
 from sacformer_jax.values import unknown
@@ -246,16 +245,15 @@ def sweep(args: argparse.Namespace, flags: list[str]) -> int:
     """Trains, and reports when all is done; the exit code."""
     settings = settings_of(args)
     parsed = parse_config(flags, "sweep.py")
-    launch, config = parsed.launch, parsed.resolved.config.validated()
+    config = parsed.resolved.config.validated()
     if not config.run.run_dir:
         raise ConfigError("run_dir='': give a folder, so that the same command can go on there")
     members = members_of(settings, config)
     folder = RunFolder(config.run.run_dir)
-    choose_xla_threads(config)
-    choose_cpu_devices(config, launch, len(members), folder.latest_devices().get("members"))
-    launch.join()
+    begun_with = folder.latest_devices().get("members")
+    devices = parsed.launch.start(config, len(members), begun_with)
     try:
-        done = train_or_resume(parsed, members, launch.devices(len(members)))
+        done = train_or_resume(parsed, members, devices)
     except DivergedError:
         if is_first():
             report(folder, members)  # tells which settings broke down

@@ -16,7 +16,7 @@ import tyro
 from sacformer_jax import commands, compilation_cache, picture_commands
 from sacformer_jax.checkpoint import CheckpointError, RunFolder
 from sacformer_jax.config import Config, ConfigError
-from sacformer_jax.launch import Launch, choose_cpu_devices, choose_xla_threads
+from sacformer_jax.launch import Launch
 from sacformer_jax.loop import DivergedError
 from sacformer_jax.presets import Resolved, resolve
 from sacformer_jax.tracking import Tracking, resumed_tracking
@@ -153,13 +153,9 @@ def _train(args: list[str]) -> int:
     from sacformer_jax.runner import train
 
     parsed = parse_config(args, "sacformer train")
-    config, launch = parsed.resolved.config.validated(), parsed.launch
+    config = parsed.resolved.config.validated()
     callbacks = parsed.tracking.callbacks()
-    num_members = len(config.all_seeds)
-    choose_xla_threads(config)
-    choose_cpu_devices(config, launch, num_members)
-    launch.join()
-    devices = launch.devices(num_members)
+    devices = parsed.launch.start(config, len(config.all_seeds))
     result = train(config, parsed.resolved.sources, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0
 
@@ -169,12 +165,8 @@ def _resume(args: list[str]) -> int:
 
     parsed = tyro.cli(ResumeArgs, args=args, prog="sacformer resume")
     folder = RunFolder(parsed.run).opened()
-    known, launch = folder.read_config(), parsed.launch
-    num_members = len(known.members)
-    choose_xla_threads(known.config)
-    choose_cpu_devices(known.config, launch, num_members, folder.latest_devices().get("members"))
-    launch.join()
-    devices = launch.devices(num_members)
+    known, begun_with = folder.read_config(), folder.latest_devices().get("members")
+    devices = parsed.launch.start(known.config, len(known.members), begun_with)
     callbacks = resumed_tracking(folder.path)
     result = resume(parsed.run, parsed.total_env_steps, devices=devices, callbacks=callbacks)
     return EXIT_INTERRUPTED if result.interrupted else 0

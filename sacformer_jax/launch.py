@@ -41,10 +41,31 @@ class Launch:
     """With a coordinator: which of them this is, from 0."""
 
     @property
+    def _by_hand(self) -> tuple[str | int | None, ...]:
+        return (self.coordinator, self.num_processes, self.process_id)
+
+    @property
     def one_of_several(self) -> bool:
         """Whether there are other processes, or should be."""
-        by_hand = (self.coordinator, self.num_processes, self.process_id)
-        return self.distributed or by_hand != (None, None, None)
+        return self.distributed or self._by_hand != (None, None, None)
+
+    def start(self, config: Config, num_members: int, begun_with: int | None = None) -> Devices:
+        """Chooses threads and devices, meets the other processes; how the members lie on devices.
+
+        To be called before JAX is used.
+
+        Args:
+          config: of the run.
+          num_members: of the run.
+          begun_with: see :func:`choose_cpu_devices`.
+
+        Raises:
+          ConfigError: as of :meth:`join`.
+        """
+        choose_xla_threads(config)
+        choose_cpu_devices(config, self, num_members, begun_with)
+        self.join()
+        return self.devices(num_members)
 
     def join(self) -> None:
         """Meets the other processes, if there are any; before JAX is used.
@@ -55,8 +76,7 @@ class Launch:
         """
         if not self.one_of_several:
             return
-        by_hand = (self.coordinator, self.num_processes, self.process_id)
-        if None in by_hand and by_hand != (None, None, None):
+        if None in self._by_hand and self._by_hand != (None, None, None):
             raise ConfigError(
                 f"coordinator={self.coordinator}, num_processes={self.num_processes}, "
                 f"process_id={self.process_id}: give all three, or --distributed alone"
@@ -118,9 +138,10 @@ def choose_cpu_devices(
     if config.task.env not in TASKS or config.task.engine == "mjx":
         return
     data, cores = max(1, launch.data_devices), usable_cores()
-    fitting = [n for n in range(1, max(1, cores // data) + 1) if num_members % n == 0]
-    members = launch.seed_devices or (begun_with if begun_with in fitting else fitting[-1])
-    number = min(members * data, cores)
+    members = begun_with
+    if not members or num_members % members or members > max(1, cores // data):
+        members = Devices.for_members(num_members, data, cores).members
+    number = min((launch.seed_devices or members) * data, cores)
     if number > 1:
         # Refused where JAX has been used: a program that calls the command line as a function.
         with contextlib.suppress(RuntimeError):

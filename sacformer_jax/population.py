@@ -48,9 +48,16 @@ class Devices:
     data: int = 1
 
     @classmethod
-    def for_members(cls, num_members: int, data: int = 1) -> Devices:
-        """``data`` devices for each of as many groups of members as there are devices for."""
-        groups = max(1, jax.device_count() // max(1, data))
+    def for_members(cls, num_members: int, data: int = 1, available: int | None = None) -> Devices:
+        """``data`` devices for each of as many groups of members as there are devices for.
+
+        Args:
+          num_members: of the population.
+          data: devices of each group.
+          available: how many devices there are; default: JAX's.
+        """
+        available = jax.device_count() if available is None else available
+        groups = max(1, available // max(1, data))
         return cls(max(n for n in range(1, groups + 1) if num_members % n == 0), data)
 
     def checked(self, config: Config, num_members: int) -> Devices:

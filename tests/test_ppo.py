@@ -25,6 +25,7 @@ from sacformer_jax import (
     Devices,
     agents,
     cli,
+    launch,
     load_policy,
     make_evaluator,
     make_population,
@@ -791,7 +792,7 @@ def test_a_run_from_the_command_line_resumes_to_the_bit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # It would decide over the threads of every process that later tests start.
-    monkeypatch.setattr(cli, "choose_xla_threads", lambda config: None)
+    monkeypatch.setattr(launch, "choose_xla_threads", lambda config: None)
     path = tmp_path / "straight"
     settings = {**TINY, "seeds": 2, "run_dir": path}
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
