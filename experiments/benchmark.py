@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
-from bench import checkpointing, compiling, environments, peers, scaling, training, update
+from bench import checkpointing, compiling, environments, members, peers, scaling, training, update
 from bench.clock import Clock
 from machine import cpu_model
 
@@ -33,6 +33,7 @@ PARTS: dict[str, Measure] = {
     "train": training.measure,
     "peer": peers.measure,
     "scaling": scaling.measure,
+    "members": members.measure,
     "checkpoint": checkpointing.measure,
     "compile": compiling.measure,
 }

@@ -10,10 +10,10 @@ import benchmark
 import jax
 import jax.numpy as jnp
 import pytest
-from bench import checkpointing, scaling
+from bench import checkpointing, members, scaling
 from bench.clock import Clock
 
-from sacformer_jax import Config
+from sacformer_jax import Config, Devices
 from sacformer_jax.buffer import TrajectoryBuffer
 
 TINY = {
@@ -107,6 +107,32 @@ def test_seeds_are_trained_in_one_program():
     one, two = (results[f"scaling.seeds.{size}.state_bytes"] for size in (1, 2))
     assert two == 2 * one - 3 * 4
     assert results["scaling.seeds.2.temp_bytes"] > 0
+
+
+def test_cores_of_their_own_are_compared_round_by_round():
+    """Rounds in which everything took ten times as long must not decide."""
+    config = Config.from_preset("cpu", **TINY)
+    found = members.told(config, {"one": [2.0, 30.0, 4.0], "each": [1.0, 10.0, 5.0]})
+    assert (found["times_lowest"], found["times"], found["times_highest"]) == (0.8, 2.0, 3.0)
+    assert found["one_device.steps_per_s"] == 20 / 4
+    assert found["core_each.steps_per_s"] == 20 / 5
+
+
+@pytest.mark.parametrize("case", members.CASES)
+def test_cases_of_members_are_split_over_two_cores(case):
+    config = members.config_of(case)
+    assert f"_{len(config.all_seeds)}" == case[case.rindex("_") :]
+    assert Devices.for_members(len(config.all_seeds), available=2).members == 2
+
+
+@pytest.mark.slow
+def test_members_are_timed_on_one_device_and_on_several():
+    """The frame alone: how long tiny ones take says nothing."""
+    config = Config.from_preset("cpu", **TINY, seeds=2)
+    choices = {"one": Devices(1), "each": Devices(2)}
+    seconds = members.chunk_seconds(config, choices, rounds=2)
+    assert list(seconds) == ["one", "each"]
+    assert all(len(each) == 2 and min(each) > 0 for each in seconds.values())
 
 
 @pytest.mark.slow

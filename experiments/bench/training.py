@@ -32,6 +32,8 @@ CASES: dict[str, dict[str, Any]] = {
         "chunk_env_steps": 500,
     },
     "sac_cpu": {"preset": "cpu", "agent": "sac", "chunk_env_steps": 1_000},
+    "sacformer_best": {"preset": "best", "chunk_env_steps": 400},
+    "sac_best": {"preset": "best", "agent": "sac", "chunk_env_steps": 400},
 }
 """What differs from the preset: no more prefill than an episode for each environment, where
 hindsight needs one, and chunks of one to five seconds on two cores."""
