@@ -82,15 +82,11 @@ def extract(path: str | Path, members: Sequence[str | int], to: str | Path) -> P
                 part.metrics_path(member.name).write_bytes(metrics.read_bytes()[:num_bytes])
             if (source / "best").is_dir():
                 shutil.copytree(source / "best", goal / "best")
-        with CheckpointWriter(part, config, block_axes) as writer:
+        with CheckpointWriter(part, config, block_axes, restored.devices) as writer:
             writer.save(state, policy_of(state), progress)
         _move_up(part.path)
     except (OSError, CheckpointError) as error:
-        why = first_line(error.__cause__ or error)
-        raise CheckpointError(
-            f"to={str(target.path)!r} cannot be written ({why}): choose a folder "
-            "that can, or try again where the run is being trained"
-        ) from error
+        raise _not_written(target.path, error) from error
     finally:
         _remove(part.path)
         if made:
@@ -124,10 +120,24 @@ def _remove(path: Path) -> None:
 
 def _check_new(path: Path) -> None:
     """Refuses all but an empty folder, or one in which nothing was finished."""
-    if path.exists() and not (path.is_dir() and {each.name for each in path.iterdir()} <= {_PART}):
+    try:
+        new = not path.exists() or (
+            path.is_dir() and {each.name for each in path.iterdir()} <= {_PART}
+        )
+    except OSError as error:
+        raise _not_written(path, error) from error
+    if not new:
         raise CheckpointError(
             f"to={str(path)!r} holds a run already, or something else: choose a new folder"
         )
+
+
+def _not_written(path: Path, error: Exception) -> CheckpointError:
+    why = first_line(error.__cause__ or error)
+    return CheckpointError(
+        f"to={str(path)!r} cannot be written ({why}): choose a folder "
+        "that can, or try again where the run is being trained"
+    )
 
 
 def _config_of(config: Config, members: Sequence[Member]) -> Config:

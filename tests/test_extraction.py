@@ -177,6 +177,24 @@ def test_a_folder_that_cannot_be_made_is_named(seeds: Path, tmp_path: Path) -> N
         extract(seeds, [0], tmp_path / "file" / "to")
 
 
+def test_a_folder_that_cannot_be_read_is_named(
+    seeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(_: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", forbidden)
+    with pytest.raises(CheckpointError, match=rf"to='{tmp_path}' cannot be .*Permission denied"):
+        extract(seeds, [0], tmp_path)
+
+
+def test_it_is_known_what_the_members_were_split_over(seeds: Path, tmp_path: Path) -> None:
+    """Resuming from the command line takes as many devices again, or says that it does not."""
+    known = RunFolder(seeds).latest_devices()
+    assert known == {"members": 1, "data": 1}
+    assert RunFolder(extract(seeds, [0, 2], tmp_path / "two")).latest_devices() == known
+
+
 def test_from_the_command_line(
     seeds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
