@@ -65,7 +65,9 @@ def _orthonormal_columns(matrix: jax.Array) -> jax.Array:
             column = column - columns @ (column @ columns)
         return columns.at[:, place].set(column / jnp.linalg.norm(column))
 
-    return jax.lax.fori_loop(0, matrix.shape[1], with_column, jnp.zeros_like(matrix))
+    # Where a product of float32 has fewer digits, as on TPUs, twice would not be enough.
+    with jax.default_matmul_precision("highest"):
+        return jax.lax.fori_loop(0, matrix.shape[1], with_column, jnp.zeros_like(matrix))
 
 
 def _laid_out(x: jax.Array) -> jax.Array:

@@ -190,3 +190,12 @@ def test_orthogonal_matrices_are_the_same_among_others():
     alone = jax.jit(lambda key: orthogonal(1.0)(key, (20, 8)))
     for key, kernel in zip(keys, together, strict=True):
         np.testing.assert_array_equal(kernel, alone(key))
+
+
+def test_orthogonal_matrices_have_all_of_float32_on_accelerators():
+    """Where products have fewer digits by default, as on TPUs; the CPU's have all."""
+    with jax.default_matmul_precision("bfloat16"):
+        made = jax.make_jaxpr(lambda key: orthogonal(1.0)(key, (20, 8)))(jax.random.key(0))
+    products = [line for line in str(made).splitlines() if "dot_general" in line]
+    assert len(products) == 4
+    assert str(made).count("Precision.HIGHEST") == 2 * len(products)
