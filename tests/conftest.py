@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import jaxlib
 import pytest
 from compiling import QUICK_LOOPS
@@ -66,6 +65,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
     And has JAX make its devices: a command called as a function would choose how many otherwise.
     """
+    import jax  # only now: JAX reads what is set above
+
     jax.devices()
     gc.collect()
     gc.freeze()
