@@ -109,30 +109,24 @@ def test_seeds_are_trained_in_one_program():
     assert results["scaling.seeds.2.temp_bytes"] > 0
 
 
-def test_cores_of_their_own_are_compared_round_by_round():
-    """Rounds in which everything took ten times as long must not decide."""
-    config = Config.from_preset("cpu", **TINY)
-    found = members.told(config, {"one": [2.0, 30.0, 4.0], "each": [1.0, 10.0, 5.0]})
-    assert (found["times_lowest"], found["times"], found["times_highest"]) == (0.8, 2.0, 3.0)
-    assert found["one_device.steps_per_s"] == 20 / 4
-    assert found["core_each.steps_per_s"] == 20 / 5
-
-
 @pytest.mark.parametrize("case", members.CASES)
 def test_cases_of_members_are_split_over_two_cores(case):
-    config = members.config_of(case)
+    config = Config.from_preset(**members.CASES[case])
     assert f"_{len(config.all_seeds)}" == case[case.rindex("_") :]
     assert Devices.for_members(len(config.all_seeds), available=2).members == 2
 
 
-@pytest.mark.slow
-def test_members_are_timed_on_one_device_and_on_several():
-    """The frame alone: how long tiny ones take says nothing."""
-    config = Config.from_preset("cpu", **TINY, seeds=2)
-    choices = {"one": Devices(1), "each": Devices(2)}
-    seconds = members.chunk_seconds(config, choices, rounds=2)
-    assert list(seconds) == ["one", "each"]
-    assert all(len(each) == 2 and min(each) > 0 for each in seconds.values())
+def test_members_train_on_one_device_and_on_cores_of_their_own(monkeypatch):
+    tiny = {**TINY, "engine": "native", "preset": "cpu", "seeds": 2}
+    monkeypatch.setattr(members, "CASES", {"tiny_2": tiny})
+    monkeypatch.setattr(members, "ROUNDS", 2)
+    results = members.measure(Clock())
+    for way in ("one_device", "core_each"):
+        assert results[f"members.tiny_2.{way}.steps_per_s"] > 0
+        rate = results[f"members.tiny_2.{way}.updates_per_env_step"]
+        assert rate == Config.from_preset(**tiny).replay.updates_per_env_step
+    assert results["members.tiny_2.core_each_over_fastest"] > 0
+    assert results["members.tiny_2.fastest_peer"] == "one_device"
 
 
 @pytest.mark.slow

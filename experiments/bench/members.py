@@ -1,28 +1,35 @@
 """Part `members`: several seeds on one device of the CPU, and on a core each.
 
-The second is what ``sacformer train`` chooses (``launch.choose_cpu_devices``). Each case is
-measured in a process of its own with a device for each core, of which the first program uses one.
+The second is what ``sacformer train`` chooses (``launch.choose_cpu_devices``), the first what its
+``--seed-devices 1`` does. Each is a process of its own, since it decides on XLA's threads, too;
+they train in turns (peer_programs/protocol.py).
 """
 
 from __future__ import annotations
 
 import json
-import statistics
 import sys
 import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 
-from bench.child import answer_of
 from bench.clock import Clock
-from sacformer_jax import Config, Devices, make_population, seed_members
-from sacformer_jax.launch import Launch, choose_cpu_devices, choose_xla_threads
-from sacformer_jax.population import ONE_DEVICE
+from bench.peer_programs.host import Program
+from bench.peer_programs.protocol import Conversation
+from bench.peers import compare
+from sacformer_jax import Config, make_population, seed_members
+from sacformer_jax.launch import Launch
 from sacformer_jax.types import TrainState
 
+EXPERIMENTS = Path(__file__).resolve().parents[1]
 ROUNDS = 7
-LIMIT_SECONDS = 600.0
+LIMIT_SECONDS = 240.0
+CHUNK_ENV_STEPS = 400
+"""Of a round, where a case does not say: one to ten seconds."""
 CASES: dict[str, dict[str, Any]] = {
     "sacformer_cpu_2": {"env": "HalfCheetah", "preset": "cpu", "seeds": 2},
     "sacformer_cpu_4": {"env": "HalfCheetah", "preset": "cpu", "seeds": 4},
@@ -38,80 +45,58 @@ CASES: dict[str, dict[str, Any]] = {
     },
 }
 """By name; the last part is the number of seeds."""
-CHUNK_ENV_STEPS = 400
-"""Of a round, where a case does not say: one to ten seconds."""
 
 
-def chunk_seconds(
-    config: Config, choices: dict[str, Devices], rounds: int
-) -> dict[str, list[float]]:
-    """Seconds of a chunk of all members in each round, the choices taking turns; a chunk before the
-    first round is not counted.
+def start(fields: Mapping[str, Any], seed_devices: int | None) -> Program:
+    """Starts the training of a configuration, with the flag ``--seed-devices`` or without it."""
+    asked = {"fields": dict(fields), "seed_devices": seed_devices}
+    command = [sys.executable, "-m", "bench.members", json.dumps(asked)]
+    return Program(command, {"PYTHONPATH": str(EXPERIMENTS)}, LIMIT_SECONDS)
+
+
+def measure(clock: Clock) -> dict[str, float | str]:
+    """All cases by flat keys ``members.CASE.WHAT``.
+
+    ``one_device.steps_per_s`` and ``core_each.steps_per_s`` are env steps per second of each seed,
+    and ``core_each_over_fastest`` says how many times as fast cores of their own are; all as of
+    :func:`bench.peers.compare`.
     """
-    members = seed_members(config.all_seeds)
-    populations = {name: make_population(config, members, each) for name, each in choices.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in choices}
-    states: dict[str, TrainState] = {}
-    for name, population in populations.items():
-        state = population.init()
-        if config.prefill_vector_steps:
-            state, _ = population.prefill(state)
-        states[name], _ = jax.block_until_ready(population.train_chunk(state))
-    for _ in range(rounds):
-        for name, population in populations.items():
-            start = time.perf_counter()
-            states[name], _ = jax.block_until_ready(population.train_chunk(states[name]))
-            seconds[name].append(time.perf_counter() - start)
-    return seconds
-
-
-def told(config: Config, seconds: dict[str, list[float]]) -> dict[str, float]:
-    """Env steps per second of each seed, and how many times as fast cores of their own are: the
-    median of the rounds, the lowest and the highest.
-    """
-    times = [one / each for one, each in zip(seconds["one"], seconds["each"], strict=True)]
-    steps = config.env_steps_per_chunk
-    return {
-        "one_device.steps_per_s": steps / statistics.median(seconds["one"]),
-        "core_each.steps_per_s": steps / statistics.median(seconds["each"]),
-        "times": statistics.median(times),
-        "times_lowest": min(times),
-        "times_highest": max(times),
-    }
-
-
-def measure(clock: Clock) -> dict[str, float]:
-    """All cases by flat keys ``members.CASE.WHAT``; see :func:`told`.
-
-    Raises:
-      RuntimeError: one failed.
-      subprocess.TimeoutExpired: one took longer than ``LIMIT_SECONDS``.
-    """
-    results: dict[str, float] = {}
-    for case in CASES:
-        print(f"members of {case} …", file=sys.stderr, flush=True)
-        answer = answer_of("bench.members", case, limit_seconds=LIMIT_SECONDS)
-        results |= {f"members.{case}.{what}": float(value) for what, value in answer.items()}
+    del clock  # ratios of programs that take turns
+    results: dict[str, float | str] = {}
+    for name, fields in CASES.items():
+        case = {"engine": "native", "chunk_env_steps": CHUNK_ENV_STEPS, **fields}
+        ways = {"one_device": partial(start, case, 1), "core_each": partial(start, case, None)}
+        results |= compare(ways, f"members.{name}", ROUNDS, ours="core_each")
     return results
 
 
-def config_of(case: str) -> Config:
-    """One of ``CASES``, on engine native."""
-    return Config.from_preset(
-        **{"engine": "native", "chunk_env_steps": CHUNK_ENV_STEPS, **CASES[case]}
+def main() -> None:
+    """One of the processes: trains by stretches of one chunk."""
+    asked = json.loads(sys.argv[1])
+    config = Config.from_preset(**asked["fields"])
+    members = seed_members(config.all_seeds)
+    devices = Launch(seed_devices=asked["seed_devices"]).start(config, len(members))
+    population = make_population(config, members, devices)
+    state = population.init()
+    if config.prefill_vector_steps:
+        state, _ = population.prefill(state)
+    state, _ = jax.block_until_ready(population.train_chunk(state))
+    networks = (state.learner.actor_params, state.learner.critic_params)
+    conversation = Conversation()
+    conversation.ready(
+        "sacformer-jax", "jax", parameters=sum(leaf.size for leaf in jax.tree.leaves(networks))
     )
+    while conversation.wanted():
+        updates = _updates(state)
+        begun = time.perf_counter()
+        state, _ = jax.block_until_ready(population.train_chunk(state))
+        seconds = time.perf_counter() - begun
+        conversation.report(config.env_steps_per_chunk, _updates(state) - updates, seconds)
 
 
-def main(case: str) -> None:
-    """The process of a case."""
-    config = config_of(case)
-    num_members = len(config.all_seeds)
-    choose_xla_threads(config)
-    choose_cpu_devices(config, Launch(), num_members)
-    choices = {"one": ONE_DEVICE, "each": Devices.for_members(num_members)}
-    found = told(config, chunk_seconds(config, choices, ROUNDS))
-    print(json.dumps({"devices": choices["each"].members, **found}))
+def _updates(state: TrainState) -> int:
+    return int(state.counters.updates.max())  # [S], the same for all
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main()

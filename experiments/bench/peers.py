@@ -155,13 +155,16 @@ def measure(clock: Clock) -> dict[str, float | str]:
     return results
 
 
-def compare(starts: Mapping[str, Start], prefix: str, rounds: int) -> dict[str, float | str]:
+def compare(
+    starts: Mapping[str, Start], prefix: str, rounds: int, ours: str = "ours"
+) -> dict[str, float | str]:
     """Starts all programs, lets them train in rounds, stops them; see :func:`measure`.
 
     Args:
-      starts: starts a program, by name; ``ours`` is compared with the fastest other.
+      starts: starts a program, by name.
       prefix: of the keys.
       rounds: stretches of each.
+      ours: the name of the one that is compared with the fastest other.
     """
     programs: dict[str, Program] = {}
     facts: dict[str, Answer] = {}
@@ -198,7 +201,7 @@ def compare(starts: Mapping[str, Start], prefix: str, rounds: int) -> dict[str, 
     for name in facts:
         summary = {**_summary(facts[name]), **_speed(stretches[name])}
         results |= {f"{prefix}.{name}.{what}": value for what, value in summary.items()}
-    return results | _comparison({name: stretches[name] for name in facts}, prefix)
+    return results | _comparison({name: stretches[name] for name in facts}, prefix, ours)
 
 
 def _rates(stretches: list[Answer]) -> list[float]:
@@ -223,17 +226,19 @@ def _speed(stretches: list[Answer]) -> dict[str, float]:
     }
 
 
-def _comparison(stretches: dict[str, list[Answer]], prefix: str) -> dict[str, float | str]:
+def _comparison(
+    stretches: dict[str, list[Answer]], prefix: str, ours: str
+) -> dict[str, float | str]:
     """Ours over the fastest peer, if there is one to compare with."""
     rates = {name: _rates(answers) for name, answers in stretches.items()}
-    ours = rates.pop("ours", None)
-    if ours is None or not rates:
+    own = rates.pop(ours, None)
+    if own is None or not rates:
         return {}
     medians = {name: statistics.median(of_one) for name, of_one in rates.items()}
     fastest = max(medians, key=lambda name: medians[name])
     # Round by round: what slows the machine down for a while slows both.
-    by_round = [mine / theirs for mine, theirs in zip(ours, rates[fastest], strict=True)]
+    by_round = [mine / theirs for mine, theirs in zip(own, rates[fastest], strict=True)]
     return {
         f"{prefix}.fastest_peer": fastest,
-        f"{prefix}.ours_over_fastest": statistics.median(by_round),
+        f"{prefix}.{ours}_over_fastest": statistics.median(by_round),
     }

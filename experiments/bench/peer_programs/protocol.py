@@ -89,11 +89,8 @@ class Setting:
         return cls(**values | {"hidden_layers": tuple(values["hidden_layers"])})
 
 
-class Session:
-    """A program's end of the conversation."""
-
-    def __init__(self) -> None:
-        self.setting = Setting.from_json(sys.argv[1])
+class Conversation:
+    """A program's end of it."""
 
     def ready(self, *libraries: str, parameters: int) -> None:
         """Everything is compiled and warm.
@@ -116,3 +113,10 @@ class Session:
 
     def _say(self, answer: dict[str, Any]) -> None:
         print(json.dumps(answer), flush=True)
+
+
+class Session(Conversation):
+    """Of the program of a peer, which is told a setting."""
+
+    def __init__(self) -> None:
+        self.setting = Setting.from_json(sys.argv[1])
