@@ -26,8 +26,8 @@ class Launch:
     """Devices and processes. None of it is part of a run: it may be resumed elsewhere."""
 
     seed_devices: int | None = None
-    """Devices that the seeds are split over, on a CPU up to its cores; default: as many as divide
-    them.
+    """Devices that the seeds are split over, of the five tasks on engine native up to the cores of
+    a CPU; default: as many as divide them.
     """
     data_devices: int = 1
     """Devices that environments, replay and batch of each seed are split over."""
@@ -102,7 +102,8 @@ def choose_xla_threads(config: Config) -> None:
 
     Its operations are so small that handing them to another thread takes longer than doing them.
     To be called before JAX is used, later it changes nothing; who sets ``PJRT_NPROC`` or ``NPROC``
-    decides for themselves. MuJoCo's threads are others.
+    decides for themselves. With several devices it is one for each of them. MuJoCo's threads are
+    others.
     """
     width = max(config.actor.actor_width, config.critic.critic_width)
     if config.agent == "ppo" and width <= _NARROW and "NPROC" not in os.environ:
