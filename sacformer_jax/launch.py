@@ -105,9 +105,13 @@ def choose_xla_threads(config: Config) -> None:
     decides for themselves. With several devices it is one for each of them. MuJoCo's threads are
     others.
     """
-    width = max(config.actor.actor_width, config.critic.critic_width)
-    if config.agent == "ppo" and width <= _NARROW and "NPROC" not in os.environ:
+    if _is_narrow_ppo(config) and "NPROC" not in os.environ:
         os.environ.setdefault("PJRT_NPROC", "1")
+
+
+def _is_narrow_ppo(config: Config) -> bool:
+    width = max(config.actor.actor_width, config.critic.critic_width)
+    return config.agent == "ppo" and width <= _NARROW
 
 
 def choose_cpu_devices(
@@ -116,10 +120,12 @@ def choose_cpu_devices(
     """Makes the cores of a CPU devices, as many as the members are split over.
 
     One device splits every operation among the cores, and of networks as small as these handing
-    over costs much of what that gains; with members on cores of their own several train 1.3 to 1.5
+    over costs much of what that gains; with members on cores of their own several train 1.2 to 1.6
     times as fast (docs/scaling.md). That was measured, and is done, with MuJoCo tasks on engine
     native: physics in JAX factorizes matrices by LAPACK, whose kernels in jaxlib 0.10.2 wait for
-    threads that the devices share (see :func:`sacformer_jax.layers.orthogonal`).
+    threads that the devices share (see :func:`sacformer_jax.layers.orthogonal`). PPO with narrow
+    networks, which mostly steps environments, is slower so (0.85 times) and stays on one: the host
+    calls of several devices take turns.
 
     To be called before JAX is used, later it changes nothing. Who says how many devices a CPU has,
     by ``JAX_NUM_CPU_DEVICES`` or XLA's flag, decides for themselves, and several processes get no
@@ -141,7 +147,8 @@ def choose_cpu_devices(
     data, cores = max(1, launch.data_devices), usable_cores()
     members = begun_with
     if not members or num_members % members or members > max(1, cores // data):
-        members = Devices.for_members(num_members, data, cores).members
+        one = _is_narrow_ppo(config)
+        members = 1 if one else Devices.for_members(num_members, data, cores).members
     number = min((launch.seed_devices or members) * data, cores)
     if number > 1:
         # Refused where JAX has been used: a program that calls the command line as a function.

@@ -1,8 +1,8 @@
 """Part `members`: several seeds on one device of the CPU, and on a core each.
 
-The second is what ``sacformer train`` chooses (``launch.choose_cpu_devices``), the first what its
-``--seed-devices 1`` does. Each is a process of its own, since it decides on XLA's threads, too;
-they train in turns (peer_programs/protocol.py).
+What ``sacformer train`` does with ``--seed-devices 1``, and with as many as there are cores for;
+without the flag it takes what is faster (``launch.choose_cpu_devices``). Each is a process of its
+own, since it decides on XLA's threads, too; they train in turns (peer_programs/protocol.py).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from bench.clock import Clock
 from bench.peer_programs.host import Program
 from bench.peer_programs.protocol import Conversation
 from bench.peers import compare
-from sacformer_jax import Config, make_population, seed_members
+from sacformer_jax import Config, Devices, make_population, seed_members
+from sacformer_jax.cores import usable_cores
 from sacformer_jax.launch import Launch
 from sacformer_jax.types import TrainState
 
@@ -47,11 +48,17 @@ CASES: dict[str, dict[str, Any]] = {
 """By name; the last part is the number of seeds."""
 
 
-def start(fields: Mapping[str, Any], seed_devices: int | None) -> Program:
-    """Starts the training of a configuration, with the flag ``--seed-devices`` or without it."""
+def start(fields: Mapping[str, Any], seed_devices: int) -> Program:
+    """Starts the training of a configuration, its seeds split over so many devices."""
     asked = {"fields": dict(fields), "seed_devices": seed_devices}
     command = [sys.executable, "-m", "bench.members", json.dumps(asked)]
     return Program(command, {"PYTHONPATH": str(EXPERIMENTS)}, LIMIT_SECONDS)
+
+
+def cores(fields: Mapping[str, Any]) -> int:
+    """Over as many cores the seeds of a configuration can be split."""
+    num_members = len(Config.from_preset(**fields).all_seeds)
+    return Devices.for_members(num_members, available=usable_cores()).members
 
 
 def measure(clock: Clock) -> dict[str, float | str]:
@@ -65,8 +72,12 @@ def measure(clock: Clock) -> dict[str, float | str]:
     results: dict[str, float | str] = {}
     for name, fields in CASES.items():
         case = {"engine": "native", "chunk_env_steps": CHUNK_ENV_STEPS, **fields}
-        ways = {"one_device": partial(start, case, 1), "core_each": partial(start, case, None)}
-        results |= compare(ways, f"members.{name}", ROUNDS, ours="core_each")
+        results |= compare(
+            {"one_device": partial(start, case, 1), "core_each": partial(start, case, cores(case))},
+            f"members.{name}",
+            ROUNDS,
+            ours="core_each",
+        )
     return results
 
 
