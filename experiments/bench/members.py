@@ -9,26 +9,20 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
-
-import jax
 
 from bench.clock import Clock
 from bench.peer_programs.host import Program
+from bench.peer_programs.ours import train_by_chunks
 from bench.peer_programs.protocol import Conversation
-from bench.peers import compare
+from bench.peers import ENVIRONMENT, LIMIT_SECONDS, compare
 from sacformer_jax import Config, Devices, make_population, seed_members
 from sacformer_jax.cores import usable_cores
 from sacformer_jax.launch import Launch
-from sacformer_jax.types import TrainState
 
-EXPERIMENTS = Path(__file__).resolve().parents[1]
 ROUNDS = 7
-LIMIT_SECONDS = 240.0
 CHUNK_ENV_STEPS = 400
 """Of a round, where a case does not say: one to ten seconds."""
 CASES: dict[str, dict[str, Any]] = {
@@ -52,7 +46,7 @@ def start(fields: Mapping[str, Any], seed_devices: int) -> Program:
     """Starts the training of a configuration, its seeds split over so many devices."""
     asked = {"fields": dict(fields), "seed_devices": seed_devices}
     command = [sys.executable, "-m", "bench.members", json.dumps(asked)]
-    return Program(command, {"PYTHONPATH": str(EXPERIMENTS)}, LIMIT_SECONDS)
+    return Program(command, ENVIRONMENT, LIMIT_SECONDS)
 
 
 def cores(fields: Mapping[str, Any]) -> int:
@@ -88,25 +82,7 @@ def main() -> None:
     members = seed_members(config.all_seeds)
     devices = Launch(seed_devices=asked["seed_devices"]).start(config, len(members))
     population = make_population(config, members, devices)
-    state = population.init()
-    if config.prefill_vector_steps:
-        state, _ = population.prefill(state)
-    state, _ = jax.block_until_ready(population.train_chunk(state))
-    networks = (state.learner.actor_params, state.learner.critic_params)
-    conversation = Conversation()
-    conversation.ready(
-        "sacformer-jax", "jax", parameters=sum(leaf.size for leaf in jax.tree.leaves(networks))
-    )
-    while conversation.wanted():
-        updates = _updates(state)
-        begun = time.perf_counter()
-        state, _ = jax.block_until_ready(population.train_chunk(state))
-        seconds = time.perf_counter() - begun
-        conversation.report(config.env_steps_per_chunk, _updates(state) - updates, seconds)
-
-
-def _updates(state: TrainState) -> int:
-    return int(state.counters.updates.max())  # [S], the same for all
+    train_by_chunks(Conversation(), population, population.init())
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ from typing import Any
 
 import jax
 
-from bench.peer_programs.protocol import Session, Setting
-from sacformer_jax import Config, make_program
+from bench.peer_programs.protocol import Conversation, Session, Setting
+from sacformer_jax import Config, Population, Program, make_program
 from sacformer_jax.launch import choose_xla_threads
+from sacformer_jax.types import TrainState
 
 
 def config(setting: Setting) -> Config:
@@ -57,29 +58,43 @@ def _expected(setting: Setting) -> dict[str, Any]:
     return expected | {name: getattr(setting, name) for name in same_names}
 
 
+def train_by_chunks(
+    conversation: Conversation, program: Program | Population, state: TrainState
+) -> None:
+    """Prefills, trains a chunk, says that it is ready; then a chunk for every stretch.
+
+    Args:
+      conversation: with who wants the stretches.
+      program: of one member or of several, whose env steps and updates are those of each.
+      state: as ``program.init`` makes it.
+    """
+    state, _ = program.prefill(state)
+    state, _ = jax.block_until_ready(program.train_chunk(state))
+    networks = (state.learner.actor_params, state.learner.critic_params)
+    conversation.ready(
+        "sacformer-jax", "jax", parameters=sum(leaf.size for leaf in jax.tree.leaves(networks))
+    )
+    while conversation.wanted():
+        env_steps, updates = _counts(state)
+        start = time.perf_counter()
+        state, _ = jax.block_until_ready(program.train_chunk(state))
+        seconds = time.perf_counter() - start
+        env_steps_now, updates_now = _counts(state)
+        conversation.report(env_steps_now - env_steps, updates_now - updates, seconds)
+
+
+def _counts(state: TrainState) -> tuple[int, int]:
+    counters = state.counters
+    return int(counters.env_steps), int(counters.updates.max())  # [], [] or [S], the same for all
+
+
 def main() -> None:
-    """Trains by stretches of one chunk."""
+    """Trains what the setting says."""
     session = Session()
     configured = config(session.setting)
     choose_xla_threads(configured)  # as the command line does
     program = make_program(configured)
-    state = program.init(jax.random.key(session.setting.seed))
-    state, _ = program.prefill(state)
-    state, _ = jax.block_until_ready(program.train_chunk(state))
-    networks = (state.learner.actor_params, state.learner.critic_params)
-    session.ready(
-        "sacformer-jax", "jax", parameters=sum(leaf.size for leaf in jax.tree.leaves(networks))
-    )
-    while session.wanted():
-        env_steps, updates = int(state.counters.env_steps), int(state.counters.updates)
-        start = time.perf_counter()
-        state, _ = jax.block_until_ready(program.train_chunk(state))
-        seconds = time.perf_counter() - start
-        session.report(
-            int(state.counters.env_steps) - env_steps,
-            int(state.counters.updates) - updates,
-            seconds,
-        )
+    train_by_chunks(session, program, program.init(jax.random.key(session.setting.seed)))
 
 
 if __name__ == "__main__":
