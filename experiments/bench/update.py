@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from bench.clock import GEMM_FLOPS, Clock
 from sacformer_jax import Config, make_program
-from sacformer_jax.agents import faults, sac_update
+from sacformer_jax.agents import sac_update
+from sacformer_jax.agents.adam import Adam
 from sacformer_jax.agents.sac_policy import SACParts, window_policies
 from sacformer_jax.train import Program
 from sacformer_jax.types import (
@@ -142,7 +142,7 @@ def phases(program: Program, state: TrainState) -> dict[str, Callable[[], Any]]:
     def optimizer(learner: LearnerState, key: jax.Array) -> LearnerState:
         def step(params: Params, opt: Any) -> Any:
             rate, sound = 1e-9 * jax.random.uniform(key), jnp.array(True)
-            return faults.adam_where(sound, optax.scale_by_adam(), params, params, opt, rate)
+            return Adam().step_where(sound, params, params, opt, rate)
 
         actor_params, actor_opt = step(learner.actor_params, learner.actor_opt)
         critic_params, critic_opt = step(learner.critic_params, learner.critic_opt)

@@ -50,7 +50,10 @@ Update = Callable[[TrainState, jax.Array], tuple[LearnerState, Metrics]]
 def make_gradients(update: Update) -> Callable[[TrainState, jax.Array], Gradients]:
     """``(state, key) -> Gradients`` of an ``update(state, key)`` of the state's learner; jitted."""
     # What Adam makes of a gradient of 1.
-    unit = ADAM.update(jnp.ones(()), ADAM.init(jnp.zeros(())))[1].mu
+    nothing = jnp.zeros(())
+    unit = ADAM.step_where(jnp.array(True), nothing, jnp.ones(()), ADAM.init(nothing), nothing)[
+        1
+    ].mu
 
     @jax.jit
     def gradients(state: TrainState, key: jax.Array) -> Gradients:

@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from sacformer_jax.agents.adam import Adam
 from sacformer_jax.agents.core import AgentParts, Metrics
-from sacformer_jax.agents.faults import adam_where, first_fault, num_non_finite
+from sacformer_jax.agents.faults import first_fault, num_non_finite
 from sacformer_jax.critics import CriticInputs, Critics
 from sacformer_jax.types import Hyperparameters, LearnerState, Params, Window
 
-ADAM = optax.scale_by_adam()
+ADAM = Adam()
 
 CHECKED = (
     "obs", "reward", "return_to_go", "policy", "next_q", "critic_loss", "critic_gradient",
@@ -130,8 +131,8 @@ def step_critics(
     value, q_mean, grads, given = parts.data.sum((value, q_mean, grads, given))
     grad_norm = optax.global_norm(grads)
     non_finite = [*given, num_non_finite(value), num_non_finite(grad_norm)]
-    params, opt = adam_where(
-        first_fault(non_finite) < 0, ADAM, learner.critic_params, grads, learner.critic_opt,
+    params, opt = ADAM.step_where(
+        first_fault(non_finite) < 0, learner.critic_params, grads, learner.critic_opt,
         hyper.critic_learning_rate,
     )  # fmt: skip
     learner = dataclasses.replace(learner, critic_params=params, critic_opt=opt)
@@ -153,15 +154,15 @@ def step_actor(
       loss: the actor's, over all devices.
       grads: of it.
       non_finite: as :func:`step_critics` returns it.
-      learning_rate: as :func:`~sacformer_jax.agents.faults.adam_where` takes it.
+      learning_rate: as :func:`~sacformer_jax.agents.adam.Adam.step_where` takes it.
 
     Returns:
       the learner, metrics, and the update's ``fault``.
     """
     grad_norm = optax.global_norm(grads)
     fault = first_fault([*non_finite, num_non_finite(loss), num_non_finite(grad_norm)])
-    params, opt = adam_where(
-        fault < 0, ADAM, learner.actor_params, grads, learner.actor_opt, learning_rate
+    params, opt = ADAM.step_where(
+        fault < 0, learner.actor_params, grads, learner.actor_opt, learning_rate
     )
     learner = dataclasses.replace(learner, actor_params=params, actor_opt=opt)
     return learner, {"actor_loss": loss, "actor_grad_norm": grad_norm}, fault

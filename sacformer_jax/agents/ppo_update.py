@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import optax
 
 from sacformer_jax import advantages, normalizer
+from sacformer_jax.agents.adam import Adam
 from sacformer_jax.agents.core import Metrics, Prepared
-from sacformer_jax.agents.faults import adam_where, first_fault, num_non_finite
+from sacformer_jax.agents.faults import first_fault, num_non_finite
 from sacformer_jax.agents.ppo_policy import PpoParts, entropy, log_prob
 from sacformer_jax.parallel import DataAxis
 from sacformer_jax.types import Hyperparameters, LearnerState, Params, Rollout
 
-ADAM = optax.scale_by_adam(eps=1e-5)
+ADAM = Adam(eps=1e-5)
 
 CHECKED = (
     "obs", "advantage", "value_target", "policy", "value", "actor_loss", "critic_loss",
@@ -217,11 +218,11 @@ def _step(
     assert learner.num_updates is not None
     factor = learning_rate_factor(parts, learner.num_updates)
     rates = hyper.actor_learning_rate * factor, hyper.critic_learning_rate * factor
-    actor_params, actor_opt = adam_where(
-        fault < 0, ADAM, learner.actor_params, actor_grads, learner.actor_opt, rates[0]
+    actor_params, actor_opt = ADAM.step_where(
+        fault < 0, learner.actor_params, actor_grads, learner.actor_opt, rates[0]
     )
-    critic_params, critic_opt = adam_where(
-        fault < 0, ADAM, learner.critic_params, critic_grads, learner.critic_opt, rates[1]
+    critic_params, critic_opt = ADAM.step_where(
+        fault < 0, learner.critic_params, critic_grads, learner.critic_opt, rates[1]
     )
     learner = dataclasses.replace(
         learner,

@@ -6,6 +6,7 @@ Letters: B windows, K steps, A action size.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from sacformer_jax import normalizer
 from sacformer_jax.agents import sac_policy
 from sacformer_jax.agents.core import Agent, Metrics
-from sacformer_jax.agents.faults import adam_where, first_fault
+from sacformer_jax.agents.faults import first_fault
 from sacformer_jax.agents.off_policy import (
     ADAM,
     CHECKED,
@@ -152,13 +153,32 @@ class _Half:
     noise: jax.Array
 
 
+def _two_draws(
+    parts: SACParts, keys: jax.Array, shape: tuple[int, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Standard normal draws of ``shape``, one for each of two keys.
+
+    They come out of a loop, which carries them: outside of one, on CPUs, XLA computes them again
+    for every reader, together with what that does, in code too long to be vectorized. Nor does it
+    vectorize a draw whose last axis is short, so that they are flat until they leave the loop.
+    """
+    size = (math.prod(shape),)
+
+    def turn(
+        drawn: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], None]:
+        return (drawn[1], parts.data.normal(key, size)), None
+
+    (first, second), _ = jax.lax.scan(turn, (jnp.zeros(size), jnp.zeros(size)), keys)
+    return first.reshape(shape), second.reshape(shape)
+
+
 def _after_critics(
     parts: SACParts, learner: LearnerState, hyper: Hyperparameters, window: Window, key: jax.Array
 ) -> _Half:
     """π over the window, and the critics' step."""
     keys = jax.random.split(key, 3)
-    # Both in one draw: a draw costs time however small it is.
-    next_noise, noise = jax.vmap(lambda key: parts.data.normal(key, window.action.shape))(keys[1:])
+    next_noise, noise = _two_draws(parts, keys[1:], window.action.shape)
 
     def policies(actor_params: Params) -> tuple[Any, WindowPolicies]:
         dropout_key = parts.data.own_key(keys[0])
@@ -209,8 +229,8 @@ def _update(
     alpha = _alpha(learner)
     if parts.tune_alpha:
         alpha_grad = alpha * (actor_metrics["entropy"] - hyper.target_entropy)
-        log_alpha, alpha_opt = adam_where(
-            fault < 0, ADAM, learner.log_alpha, alpha_grad, learner.alpha_opt,
+        log_alpha, alpha_opt = ADAM.step_where(
+            fault < 0, learner.log_alpha, alpha_grad, learner.alpha_opt,
             hyper.alpha_learning_rate,
         )  # fmt: skip
         learner = dataclasses.replace(learner, log_alpha=log_alpha, alpha_opt=alpha_opt)
