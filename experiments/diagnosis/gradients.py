@@ -51,9 +51,9 @@ def make_gradients(update: Update) -> Callable[[TrainState, jax.Array], Gradient
     """``(state, key) -> Gradients`` of an ``update(state, key)`` of the state's learner; jitted."""
     # What Adam makes of a gradient of 1.
     nothing = jnp.zeros(())
-    unit = ADAM.step_where(jnp.array(True), nothing, jnp.ones(()), ADAM.init(nothing), nothing)[
-        1
-    ].mu
+    fresh = ADAM.init(nothing)
+    _, stepped = ADAM.step_where(jnp.array(True), nothing, jnp.ones(()), fresh, nothing)
+    unit = stepped.mu
 
     @jax.jit
     def gradients(state: TrainState, key: jax.Array) -> Gradients:
